@@ -1,0 +1,34 @@
+# Two commands matter: `make demo` and `make test`. Both set up .venv by themselves.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+SRC := $(shell find src tests experiments -name '*.py' 2>/dev/null)
+
+.PHONY: demo test check format clean
+
+# One environment serves all targets; uv.lock decides every version.
+$(VENV)/.ready: pyproject.toml uv.lock
+	@$(PYTHON) -c "import sys; v = sys.version_info; sys.exit(0 if (3, 11) <= v[:2] < (3, 14) else f'physxnet_jax needs Python 3.11 to 3.13, $(PYTHON) is {v[0]}.{v[1]}: set PYTHON=python3.12, say')"
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet "uv>=0.8"
+	UV_PROJECT_ENVIRONMENT=$(abspath $(VENV)) $(BIN)/uv sync --quiet --frozen --inexact --python $(BIN)/python --extra usd --extra render --extra dev
+	@touch $@
+
+demo: $(VENV)/.ready
+	$(BIN)/physxnet demo --out out
+
+test: $(VENV)/.ready
+	$(BIN)/python -m pytest
+
+check: $(VENV)/.ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+format: $(VENV)/.ready
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) out dist .pytest_cache

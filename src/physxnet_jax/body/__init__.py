@@ -1,0 +1,19 @@
+"""The human body: shape, pose and skin. Knows nothing of motion files."""
+
+from ._align import (
+    align_bones as align_bones,
+    align_global as align_global,
+    bone_directions as bone_directions,
+    smallest_rotation as smallest_rotation,
+)
+from ._body import (
+    NUM_BODY_VERTICES as NUM_BODY_VERTICES,
+    Body as Body,
+    load_body as load_body,
+    triangulate as triangulate,
+)
+from ._kinematics import (
+    blend_rotations as blend_rotations,
+    forward_kinematics as forward_kinematics,
+    linear_blend_skinning as linear_blend_skinning,
+)

@@ -1,0 +1,51 @@
+"""Exceptions whose text says what was got, what was expected and how to fix it."""
+
+
+class PhysXNetError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class MeshError(PhysXNetError, ValueError):
+    """A mesh can't be used as it is (shape, topology, scale, position)."""
+
+
+class MotionError(PhysXNetError, ValueError):
+    """A motion file or clip can't be read or retargeted."""
+
+    @classmethod
+    def at(cls, path: object, line: int | None, problem: str, fix: str) -> "MotionError":
+        """Error text with file, line and fix, in that order."""
+        place = f"{path}:{line}" if line is not None else f"{path}"
+        return cls(f"{place}: {problem}. {fix}")
+
+
+class FormatError(PhysXNetError, ValueError):
+    """A file's name or content isn't of a format this package knows."""
+
+
+class MissingDependencyError(PhysXNetError, ImportError):
+    """An optional library is needed; the text says which extra installs it."""
+
+
+class SimulationError(PhysXNetError, RuntimeError):
+    """A rollout ended with a status that says its result can't be trusted."""
+
+
+class WeightsError(PhysXNetError, ValueError):
+    """Weights, their config or their atlas don't fit together."""
+
+
+class BrokenInstallError(PhysXNetError, RuntimeError):
+    """The installed jaxlib is known to compute wrong numbers."""
+
+
+__all__ = [
+    "BrokenInstallError",
+    "FormatError",
+    "MeshError",
+    "MissingDependencyError",
+    "MotionError",
+    "PhysXNetError",
+    "SimulationError",
+    "WeightsError",
+]

@@ -1,0 +1,33 @@
+"""Meshes and what can be asked of them. Knows nothing of bodies or garments."""
+
+from ._barycentric import interpolate as interpolate
+from ._closest import (
+    ClosestPoints as ClosestPoints,
+    closest_among as closest_among,
+    closest_barycentric as closest_barycentric,
+    closest_points as closest_points,
+    signed_distance as signed_distance,
+)
+from ._intersect import self_intersections as self_intersections
+from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
+from ._normals import face_normals as face_normals, vertex_normals as vertex_normals
+from ._raycast import RayHits as RayHits, cast_rays as cast_rays
+from ._rotation import (
+    matrix_from_quaternion as matrix_from_quaternion,
+    polar_rotation as polar_rotation,
+    quaternion_conjugate as quaternion_conjugate,
+    quaternion_from_axis_angle as quaternion_from_axis_angle,
+    quaternion_multiply as quaternion_multiply,
+    safe_norm as safe_norm,
+    safe_normalize as safe_normalize,
+)
+from ._topology import (
+    Edges as Edges,
+    boundary_loops as boundary_loops,
+    connected_components as connected_components,
+    greedy_colours as greedy_colours,
+    hinges as hinges,
+    manifold_report as manifold_report,
+    mesh_edges as mesh_edges,
+    vertex_faces as vertex_faces,
+)

@@ -1,0 +1,236 @@
+"""Closest points on triangles, and signed distance to closed meshes."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ._mesh import TriMesh
+from ._normals import face_normals, vertex_normals
+from ._rotation import safe_normalize
+from ._topology import mesh_edges
+
+_FACE_CHUNK = 256
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class ClosestPoints:
+    """Closest points of a mesh.
+
+    Attributes:
+        face: The face that holds the closest point, shape [points].
+        weights: Its barycentric coordinates, all >= 0, sum 1, shape [points, 3].
+        squared_distance: Squared distance [m^2], shape [points].
+    """
+
+    face: Int[Array, " points"]
+    weights: Float[Array, "points 3"]
+    squared_distance: Float[Array, " points"]
+
+
+def closest_barycentric(
+    p: Float[Array, "3 *batch"],
+    a: Float[Array, "3 *batch"],
+    b: Float[Array, "3 *batch"],
+    c: Float[Array, "3 *batch"],
+) -> tuple[Float[Array, "3 *batch"], Float[Array, "*batch"]]:
+    """Barycentric coordinates of the point of triangle abc closest to p.
+
+    The component axis comes first, so that the work is element-wise over the rest.
+    Finite, with finite gradient, for triangles degenerated to a line or to a point.
+
+    Args:
+        p: Query points [m].
+        a: First corners [m].
+        b: Second corners [m].
+        c: Third corners [m].
+
+    Returns:
+        Weights of a, b and c (>= 0, sum 1) and the squared distance [m^2].
+
+    References:
+        Ericson, Real-Time Collision Detection (2005), section 5.1.5.
+    """
+    ab, ac, ap = b - a, c - a, p - a
+    d1, d2 = _dot(ab, ap), _dot(ac, ap)
+    bp = p - b
+    d3, d4 = _dot(ab, bp), _dot(ac, bp)
+    cp = p - c
+    d5, d6 = _dot(ab, cp), _dot(ac, cp)
+    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
+    zero, one = jnp.zeros_like(d1), jnp.ones_like(d1)
+
+    def ratio(num: Array, den: Array) -> Array:
+        ok = den > 0
+        return jnp.where(ok, num / jnp.where(ok, den, one), zero)
+
+    total = va + vb + vc
+    v, w = ratio(vb, total), ratio(vc, total)
+    edge_bc = (va <= 0) & (d4 - d3 >= 0) & (d5 - d6 >= 0)
+    t = ratio(d4 - d3, (d4 - d3) + (d5 - d6))
+    v, w = jnp.where(edge_bc, 1 - t, v), jnp.where(edge_bc, t, w)
+    edge_ac = (vb <= 0) & (d2 >= 0) & (d6 <= 0)
+    v = jnp.where(edge_ac, zero, v)
+    w = jnp.where(edge_ac, ratio(d2, d2 - d6), w)
+    edge_ab = (vc <= 0) & (d1 >= 0) & (d3 <= 0)
+    v = jnp.where(edge_ab, ratio(d1, d1 - d3), v)
+    w = jnp.where(edge_ab, zero, w)
+    at_c = (d6 >= 0) & (d5 <= d6)
+    v, w = jnp.where(at_c, zero, v), jnp.where(at_c, one, w)
+    at_b = (d3 >= 0) & (d4 <= d3)
+    v, w = jnp.where(at_b, one, v), jnp.where(at_b, zero, w)
+    at_a = (d1 <= 0) & (d2 <= 0)
+    v, w = jnp.where(at_a, zero, v), jnp.where(at_a, zero, w)
+    gap = ap - v[None] * ab - w[None] * ac
+    return jnp.stack([1 - v - w, v, w]), _dot(gap, gap)
+
+
+def _dot(x: Array, y: Array) -> Array:
+    return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
+
+
+@jax.jit
+def closest_points(
+    mesh: TriMesh, points: Float[Array, "points 3"]
+) -> ClosestPoints:
+    """Exact closest points by comparing with every face, a chunk of faces at a time.
+
+    Memory is bounded by points x 256 faces. Time is points x faces: for repeated
+    queries near a known place use candidates (`closest_among`).
+
+    Args:
+        mesh: The mesh.
+        points: Query points [m].
+
+    Returns:
+        Closest faces, barycentric weights and squared distances. Of equally near
+        faces the first is taken.
+    """
+    faces = mesh.faces
+    n = faces.shape[0]
+    chunk = min(_FACE_CHUNK, n)
+    blocks = -(-n // chunk)
+    index = jnp.minimum(jnp.arange(blocks * chunk, dtype=jnp.int32), n - 1)
+    p = points.T[:, None, :]
+
+    def step(carry: tuple[Array, Array, Array], block: Array) -> tuple[tuple, None]:
+        best_d, best_f, best_w = carry
+        corner = [mesh.vertices[faces[block, k]].T[:, :, None] for k in range(3)]
+        q = jnp.broadcast_to(p, (3, chunk, points.shape[0]))
+        w, d = closest_barycentric(
+            q, *(jnp.broadcast_to(x, q.shape) for x in corner)
+        )
+        near = jnp.argmin(d, axis=0)
+        lane = jnp.arange(points.shape[0])
+        d, w, f = d[near, lane], w[:, near, lane], block[near]
+        better = d < best_d
+        return (
+            jnp.where(better, d, best_d),
+            jnp.where(better, f, best_f),
+            jnp.where(better[None], w, best_w),
+        ), None
+
+    m = points.shape[0]
+    start = (
+        jnp.full((m,), jnp.inf, points.dtype),
+        jnp.zeros((m,), jnp.int32),
+        jnp.zeros((3, m), points.dtype),
+    )
+    (d, f, w), _ = jax.lax.scan(step, start, index.reshape(blocks, chunk))
+    return ClosestPoints(f, w.T, d)
+
+
+def closest_among(
+    mesh: TriMesh,
+    points: Float[Array, "points 3"],
+    candidates: Int[Array, "points k"],
+) -> ClosestPoints:
+    """Closest points among a short list of faces for each point.
+
+    Args:
+        mesh: The mesh.
+        points: Query points [m].
+        candidates: Faces to compare, shape [points, k].
+
+    Returns:
+        As `closest_points`, over the candidates only.
+    """
+    corner = [
+        jnp.moveaxis(mesh.vertices[mesh.faces[candidates, k]], -1, 0) for k in range(3)
+    ]
+    p = jnp.broadcast_to(points.T[:, :, None], corner[0].shape)
+    w, d = closest_barycentric(p, *corner)
+    near = jnp.argmin(d, axis=1)
+    lane = jnp.arange(points.shape[0])
+    return ClosestPoints(
+        candidates[lane, near].astype(jnp.int32), w[:, lane, near].T, d[lane, near]
+    )
+
+
+def signed_distance(
+    mesh: TriMesh,
+    points: Float[Array, "points 3"],
+    *,
+    closest: ClosestPoints | None = None,
+) -> Float[Array, " points"]:
+    """Distance to a closed mesh [m], negative inside.
+
+    The sign comes from the pseudonormal of the closest feature (face, edge or
+    vertex), which is right everywhere on a closed, consistently oriented mesh.
+
+    Args:
+        mesh: A closed mesh, faces outwards.
+        points: Query points [m].
+        closest: Known closest points; exact ones are found if omitted.
+
+    Returns:
+        Signed distances.
+
+    References:
+        Baerentzen and Aanaes (2005).
+    """
+    hit = closest_points(mesh, points) if closest is None else closest
+    edges = mesh_edges(np.asarray(mesh.faces))
+    normals = face_normals(mesh.vertices, mesh.faces)
+    beside = jnp.asarray(edges.faces)
+    second = jnp.where(beside[:, 1] >= 0, beside[:, 1], beside[:, 0])
+    edge_normals = normals[beside[:, 0]] + normals[second]
+    corner_normals = vertex_normals(mesh.vertices, mesh.faces)
+    return _sign(
+        mesh, points, hit, normals, edge_normals, corner_normals, edges.of_face
+    )
+
+
+def _sign(
+    mesh: TriMesh,
+    points: Array,
+    hit: ClosestPoints,
+    normals: Array,
+    edge_normals: Array,
+    corner_normals: Array,
+    of_face: Int[np.ndarray, "faces 3"],
+) -> Array:
+    tiny = 1e-6
+    on: Bool[Array, "points 3"] = hit.weights <= tiny
+    count = jnp.sum(on.astype(jnp.int32), axis=1)
+    corner = jnp.argmax(hit.weights, axis=1)
+    gone = jnp.argmin(hit.weights, axis=1)
+    lane = jnp.arange(points.shape[0])
+    tri = mesh.faces[hit.face]
+    normal = jnp.where(
+        (count >= 2)[:, None],
+        corner_normals[tri[lane, corner]],
+        jnp.where(
+            (count == 1)[:, None],
+            edge_normals[jnp.asarray(of_face)[hit.face, gone]],
+            normals[hit.face],
+        ),
+    )
+    foot = jnp.einsum("pk,pkc->pc", hit.weights, mesh.vertices[tri])
+    gap = points - foot
+    side = jnp.sum(gap * safe_normalize(normal), axis=1)
+    distance = jnp.sqrt(hit.squared_distance)
+    return jnp.where(side < 0, -distance, distance)
