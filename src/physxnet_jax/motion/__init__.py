@@ -1,0 +1,24 @@
+"""Motion of the body: files, retargeting, resampling and built-in clips."""
+
+from ._asf_amc import read_amc as read_amc
+from ._bvh import read_bvh as read_bvh
+from ._load import load_motion as load_motion, save_motion as save_motion
+from ._motion import (
+    Motion as Motion,
+    animate as animate,
+    body_animation as body_animation,
+    make_motion as make_motion,
+    resample as resample,
+    sample as sample,
+    slerp as slerp,
+)
+from ._procedural import CLIPS as CLIPS, procedural_clip as procedural_clip
+from ._retarget import (
+    JOINT_MAPS as JOINT_MAPS,
+    LIMBS as LIMBS,
+    find_joint_map as find_joint_map,
+    foot_heights as foot_heights,
+    retarget as retarget,
+    stand_on_floor as stand_on_floor,
+)
+from ._source import SourceClip as SourceClip

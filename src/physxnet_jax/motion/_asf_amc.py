@@ -1,0 +1,235 @@
+"""Reader of Acclaim skeleton and motion files (ASF/AMC), the CMU originals."""
+
+import dataclasses
+import pathlib
+import re
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import MotionError
+from ._source import SourceClip
+from ._text import numbers, read_lines
+
+# CMU's files carry no rate; the database was captured at 120 Hz.
+CMU_FPS = 120.0
+_DOFS = {"rx": 0, "ry": 1, "rz": 2}
+
+
+@dataclasses.dataclass
+class _Bone:
+    name: str = ""
+    direction: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(3))
+    length: float = 0.0
+    axis: Rotation = dataclasses.field(default_factory=Rotation.identity)
+    order: str = "xyz"
+    dof: list[str] = dataclasses.field(default_factory=list)
+
+
+def find_skeleton(path: pathlib.Path) -> pathlib.Path:
+    """The ASF that belongs to an AMC: same subject number or same name, beside it.
+
+    Raises:
+        MotionError: If there is none, or no way to tell.
+    """
+    stems = [path.stem, path.stem.split("_")[0], re.sub(r"\d+$", "", path.stem)]
+    for stem in stems:
+        for suffix in (".asf", ".ASF"):
+            candidate = path.with_name(stem + suffix)
+            if stem and candidate.is_file():
+                return candidate
+    found = sorted(path.parent.glob("*.asf"))
+    if len(found) == 1:
+        return found[0]
+    raise MotionError.at(
+        path,
+        None,
+        f"no skeleton: looked for {', '.join(sorted({s + '.asf' for s in stems if s}))}",
+        "Put the subject's ASF beside it or name it (skeleton=…)",
+    )
+
+
+def read_amc(
+    path: str | pathlib.Path, skeleton: str | pathlib.Path | None = None
+) -> SourceClip:
+    """An AMC file with its ASF skeleton, before retargeting.
+
+    Args:
+        path: The AMC.
+        skeleton: The ASF; found beside the AMC if omitted (see `find_skeleton`).
+
+    Returns:
+        One joint a bone, at the bone's start; world rotations of the bones.
+
+    Raises:
+        MotionError: Malformed, truncated, empty or binary files, bones that the
+            skeleton doesn't have, wrong numbers of values. File, line and fix are
+            named.
+
+    References:
+        Lander, Working with Motion Capture File Formats (1998): the axis convention.
+    """
+    path = pathlib.Path(path)
+    asf = pathlib.Path(skeleton) if skeleton is not None else None
+    lines = read_lines(path, "AMC")
+    bones, links, degrees = _read_asf(asf or find_skeleton(path))
+    frames = _read_frames(path, lines, bones)
+    names = ["root"]
+    parents = [-1]
+    queue = ["root"]
+    while queue:
+        parent = queue.pop(0)
+        for child in links.get(parent, []):
+            if child in names or child not in bones:
+                raise MotionError.at(
+                    asf or find_skeleton(path), None,
+                    f"bone '{child}' is unknown or in a cycle", "Repair :hierarchy",
+                )
+            names.append(child)
+            parents.append(names.index(parent))
+            queue.append(child)
+    count = len(next(iter(frames.values())))
+    world = np.zeros((count, len(names), 3, 3))
+    offsets = np.zeros((len(names), 3))
+    for j, name in enumerate(names):
+        bone = bones[name]
+        angles = np.zeros((count, 3))
+        if name in frames:
+            for k, dof in enumerate(bone.dof):
+                if dof in _DOFS:
+                    angles[:, _DOFS[dof]] = frames[name][:, k]
+        pick = ["xyz".index(c) for c in bone.order]
+        turn = Rotation.from_euler(bone.order, angles[:, pick], degrees=degrees)
+        local = (bone.axis * turn * bone.axis.inv()).as_matrix()
+        if parents[j] < 0:
+            world[:, j] = local
+        else:
+            up = bones[names[parents[j]]]
+            offsets[j] = up.direction * up.length
+            world[:, j] = world[:, parents[j]] @ local
+    places = [bones["root"].dof.index(t) for t in ("tx", "ty", "tz")]
+    root = frames["root"][:, places]
+    return SourceClip(
+        tuple(names), tuple(parents), offsets, world, root, CMU_FPS, path.stem, str(path)
+    )
+
+
+def _read_asf(
+    path: pathlib.Path,
+) -> tuple[dict[str, _Bone], dict[str, list[str]], bool]:
+    lines = read_lines(path, "ASF")
+    bones: dict[str, _Bone] = {}
+    links: dict[str, list[str]] = {}
+    degrees = True
+    section = ""
+    bone: _Bone | None = None
+    root = _Bone(name="root", dof=["tx", "ty", "tz", "rx", "ry", "rz"])
+    for n, line in enumerate(lines, start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        key = words[0].lower()
+        if key.startswith(":"):
+            section = key[1:]
+        elif section == "units" and key == "angle":
+            degrees = not words[1].lower().startswith("rad")
+        elif section == "root":
+            if key == "order":
+                root.dof = [w.lower() for w in words[1:]]
+            elif key == "axis":
+                root.order = words[1].lower()
+        elif section == "bonedata":
+            if key == "begin":
+                bone = _Bone()
+            elif bone is None:
+                raise MotionError.at(path, n, f"'{key}' outside begin/end", "Repair it")
+            elif key == "end":
+                if not bone.name:
+                    raise MotionError.at(path, n, "a bone without a name", "Name it")
+                bones[bone.name] = bone
+                bone = None
+            elif key == "name":
+                bone.name = words[1].lower() if len(words) > 1 else ""
+            elif key == "direction":
+                bone.direction = np.asarray(_exactly(path, n, words[1:4], 3))
+            elif key == "length":
+                bone.length = _exactly(path, n, words[1:2], 1)[0]
+            elif key == "axis":
+                angles = np.asarray(_exactly(path, n, words[1:4], 3))
+                bone.order = words[4].lower() if len(words) > 4 else "xyz"
+                if sorted(bone.order) != ["x", "y", "z"]:
+                    raise MotionError.at(path, n, f"axis order '{words[4]}'", "Use XYZ")
+                pick = ["xyz".index(c) for c in bone.order]
+                bone.axis = Rotation.from_euler(bone.order, angles[pick], degrees=degrees)
+            elif key == "dof":
+                bone.dof = [w.lower() for w in words[1:]]
+        elif section == "hierarchy" and key not in ("begin", "end"):
+            links[words[0].lower()] = [w.lower() for w in words[1:]]
+    if not bones or "root" not in links:
+        raise MotionError.at(
+            path, len(lines), "no :bonedata or no :hierarchy", "The skeleton is truncated"
+        )
+    if sorted(root.dof) != sorted(["tx", "ty", "tz", "rx", "ry", "rz"]):
+        raise MotionError.at(path, None, f"root order {root.dof}", "Six dofs are needed")
+    bones["root"] = root
+    return bones, links, degrees
+
+
+def _exactly(path: pathlib.Path, n: int, words: list[str], count: int) -> list[float]:
+    out = numbers(path, n, words)
+    if len(out) != count:
+        raise MotionError.at(path, n, f"{len(out)} values, expected {count}", "Repair it")
+    return out
+
+
+def _read_frames(
+    path: pathlib.Path, lines: list[str], bones: dict[str, _Bone]
+) -> dict[str, np.ndarray]:
+    moving = [name for name, bone in bones.items() if bone.dof]
+    rows: dict[str, list[list[float]]] = {name: [] for name in moving}
+    frame = 0
+    for n, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words or words[0][0] in "#:":
+            continue
+        if len(words) == 1 and words[0].lstrip("-").isdigit():
+            _check_complete(path, n, rows, frame)
+            frame += 1
+            continue
+        name = words[0].lower()
+        if frame == 0:
+            raise MotionError.at(
+                path, n, f"'{words[0][:40]}' before the first frame number",
+                "Is this an AMC file?",
+            )
+        if name not in bones or name not in rows:
+            raise MotionError.at(
+                path, n, f"unknown bone '{words[0][:40]}'",
+                "The skeleton belongs to another file: name the right ASF",
+            )
+        if len(words) - 1 != len(bones[name].dof):
+            raise MotionError.at(
+                path, n,
+                f"{len(words) - 1} values for '{name}', the skeleton has"
+                f" {len(bones[name].dof)} channels",
+                "The line is damaged, or the ASF is another subject's",
+            )
+        rows[name].append(numbers(path, n, words[1:]))
+        if len(rows[name]) > frame:
+            raise MotionError.at(path, n, f"'{name}' twice in frame {frame}", "Repair it")
+    if frame == 0:
+        raise MotionError.at(path, len(lines), "no frame in the file", "Export it again")
+    _check_complete(path, len(lines), rows, frame)
+    return {name: np.asarray(values) for name, values in rows.items() if values}
+
+
+def _check_complete(
+    path: pathlib.Path, n: int, rows: dict[str, list[list[float]]], frame: int
+) -> None:
+    """Every bone that moved in the first frame must be in each frame."""
+    for name, values in rows.items():
+        if len(values) != frame and (values or name == "root"):
+            raise MotionError.at(
+                path, n, f"frame {frame} lacks '{name}'",
+                "The file is truncated or damaged there: cut that frame off",
+            )

@@ -1,0 +1,199 @@
+"""Reader of BVH files: any hierarchy, any channel order."""
+
+import pathlib
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..errors import MotionError
+from ._source import SourceClip
+from ._text import numbers, read_lines
+
+_AXES = {"Xrotation": "X", "Yrotation": "Y", "Zrotation": "Z"}
+_SLOTS = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
+_MAX_DEPTH = 200
+
+
+def read_bvh(path: str | pathlib.Path) -> SourceClip:
+    """A BVH file as it is, before retargeting.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Joints, offsets in the file's unit, world rotations and root positions.
+
+    Raises:
+        MotionError: Malformed, truncated, empty or binary files, wrong numbers of
+            channels or values, values that aren't finite. File, line and fix are
+            named.
+
+    References:
+        Meredith and Maddock, Motion Capture File Formats Explained (2001).
+    """
+    path = pathlib.Path(path)
+    lines = read_lines(path, "BVH")
+    joints, motion_line = _read_hierarchy(path, lines)
+    names, parents, offsets, channels = joints
+    values, fps = _read_motion(path, lines, motion_line, sum(map(len, channels)))
+    root = np.tile(offsets[0], (len(values), 1))
+    world = np.zeros((len(values), len(names), 3, 3))
+    at = 0
+    for j, chans in enumerate(channels):
+        block = values[:, at : at + len(chans)]
+        at += len(chans)
+        order = "".join(_AXES[c] for c in chans if c in _AXES)
+        turns = [k for k, c in enumerate(chans) if c in _AXES]
+        local = (
+            Rotation.from_euler(order, block[:, turns], degrees=True).as_matrix()
+            if order
+            else np.broadcast_to(np.eye(3), (len(values), 3, 3))
+        )
+        for k, c in enumerate(chans):
+            if c in _SLOTS and j == 0:
+                root[:, _SLOTS[c]] = block[:, k]
+        world[:, j] = local if parents[j] < 0 else world[:, parents[j]] @ local
+    return SourceClip(
+        tuple(names), tuple(parents), offsets, world, root, fps, path.stem, str(path)
+    )
+
+
+def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
+    names: list[str] = []
+    parents: list[int] = []
+    offsets: list[list[float]] = []
+    channels: list[list[str]] = []
+    stack: list[int] = []
+    pending = end_site = False
+    if lines[0].strip().upper() != "HIERARCHY":
+        raise MotionError.at(
+            path, 1, f"'{lines[0].strip()[:40]}' where HIERARCHY was expected",
+            "Is this a BVH file?",
+        )
+    for n, line in enumerate(lines[1:], start=2):
+        words = line.split()
+        if not words:
+            continue
+        key = words[0]
+        if key in ("ROOT", "JOINT"):
+            if key == "ROOT" and names:
+                raise MotionError.at(path, n, "a second ROOT", "Keep one skeleton a file")
+            if key == "JOINT" and not stack:
+                raise MotionError.at(path, n, "a JOINT outside any joint", "Check braces")
+            name = " ".join(words[1:]) or f"joint{len(names)}"
+            # Some exporters prefix names with a namespace.
+            names.append(name.split(":")[-1])
+            parents.append(stack[-1] if stack else -1)
+            offsets.append([])
+            channels.append([])
+            pending = True
+        elif key == "End":
+            pending = end_site = True
+        elif key == "{":
+            if not pending or len(stack) > _MAX_DEPTH:
+                raise MotionError.at(path, n, "an unexpected '{'", "Check the hierarchy")
+            stack.append(-2 if end_site else len(names) - 1)
+            pending = end_site = False
+        elif key == "}":
+            if not stack:
+                raise MotionError.at(path, n, "a '}' too many", "Check the hierarchy")
+            stack.pop()
+        elif key == "OFFSET":
+            xyz = numbers(path, n, words[1:])
+            if len(xyz) != 3 or not stack:
+                raise MotionError.at(
+                    path, n, f"OFFSET has {len(xyz)} values, expected 3", "Export again"
+                )
+            if stack[-1] >= 0:
+                offsets[stack[-1]] = xyz
+        elif key == "CHANNELS":
+            _add_channels(path, n, words, stack, channels)
+        elif key == "MOTION":
+            if stack:
+                raise MotionError.at(
+                    path, n, f"MOTION with {len(stack)} open braces", "Close them"
+                )
+            if not names:
+                raise MotionError.at(path, n, "no ROOT before MOTION", "Export again")
+            for name, offset in zip(names, offsets, strict=True):
+                if not offset:
+                    raise MotionError.at(path, n, f"joint {name} has no OFFSET", "Add one")
+            joints = (names, parents, np.asarray(offsets, dtype=np.float64), channels)
+            return joints, n
+        else:
+            raise MotionError.at(
+                path, n, f"unknown word '{key[:40]}' in the hierarchy", "Export again"
+            )
+    raise MotionError.at(
+        path, len(lines), "the file ends before MOTION", "It is truncated: export again"
+    )
+
+
+def _add_channels(
+    path: pathlib.Path,
+    n: int,
+    words: list[str],
+    stack: list[int],
+    channels: list[list[str]],
+) -> None:
+    if not stack or stack[-1] < 0:
+        raise MotionError.at(path, n, "CHANNELS outside a joint", "Check the hierarchy")
+    names = words[2:]
+    if len(words) < 2 or not words[1].isdigit() or int(words[1]) != len(names):
+        raise MotionError.at(
+            path,
+            n,
+            f"CHANNELS says {words[1] if len(words) > 1 else 'nothing'} but lists"
+            f" {len(names)} names",
+            "Make the number match the list",
+        )
+    unknown = [c for c in names if c not in _AXES and c not in _SLOTS]
+    if unknown or len(set(names)) != len(names):
+        raise MotionError.at(
+            path, n, f"unknown or repeated channel {unknown or names}",
+            "Channels are Xposition … Zrotation, each once",
+        )
+    channels[stack[-1]] = names
+
+
+def _read_motion(
+    path: pathlib.Path, lines: list[str], start: int, width: int
+) -> tuple[np.ndarray, float]:
+    body = [(n, w) for n, w in enumerate(lines[start:], start + 1) if w.strip()]
+    if len(body) < 2 or not body[0][1].strip().startswith("Frames:"):
+        raise MotionError.at(
+            path, start + 1, "no 'Frames:' after MOTION", "It is truncated: export again"
+        )
+    count = body[0][1].split(":")[1].split()
+    if len(count) != 1 or not count[0].isdigit() or int(count[0]) == 0:
+        raise MotionError.at(
+            path, body[0][0], f"'{body[0][1].strip()[:60]}' is not a number of frames",
+            "Write the number of motion lines",
+        )
+    if not body[1][1].strip().startswith("Frame Time:"):
+        raise MotionError.at(path, body[1][0], "no 'Frame Time:'", "Export again")
+    step = numbers(path, body[1][0], body[1][1].split(":")[1].split())
+    if len(step) != 1 or step[0] <= 0:
+        raise MotionError.at(path, body[1][0], "Frame Time must be positive", "Fix it")
+    rows = body[2:]
+    if len(rows) < int(count[0]):
+        raise MotionError.at(
+            path,
+            len(lines),
+            f"{len(rows)} frames of the {count[0]} announced",
+            "The file is truncated: export again, or correct 'Frames:'",
+        )
+    values = []
+    for n, row in rows[: int(count[0])]:
+        words = row.split()
+        if len(words) != width:
+            raise MotionError.at(
+                path,
+                n,
+                f"{len(words)} values where the channels need {width}",
+                "The line is damaged, or CHANNELS doesn't match: export again",
+            )
+        values.append(numbers(path, n, words))
+    # 0.0083333 is meant to be 1/120.
+    fps = 1.0 / step[0]
+    return np.asarray(values), round(fps) if abs(fps - round(fps)) < 0.05 else fps

@@ -1,0 +1,208 @@
+"""Motion of the body: joint rotations, root position and frame rate."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..body import NUM_BODY_VERTICES, Body, linear_blend_skinning
+from ..errors import MotionError
+
+# Frames compiled together: clips of any length are cut into blocks of this many.
+_BLOCK = 32
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """A clip of body motion.
+
+    Attributes:
+        rotations: Local joint rotations, wxyz, shape [frames, joints, 4].
+        root: World position of the hips joint [m], shape [frames, 3].
+        fps: Frames a second [1/s].
+        name: What the clip is called.
+    """
+
+    rotations: Float[Array, "frames joints 4"]
+    root: Float[Array, "frames 3"]
+    fps: float = dataclasses.field(metadata={"static": True})
+    name: str = dataclasses.field(default="motion", metadata={"static": True})
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+        return self.root.shape[0]
+
+
+def make_motion(
+    rotations: object, root: object, fps: float, *, name: str = "motion"
+) -> Motion:
+    """A `Motion` from host arrays, checked and normalised.
+
+    Args:
+        rotations: Local quaternions, wxyz, shape [frames, joints, 4].
+        root: Hips positions [m], shape [frames, 3].
+        fps: Frames a second.
+        name: Name used in errors and outputs.
+
+    Raises:
+        MotionError: Wrong shapes, no frame, a rate that isn't positive, a value that
+            isn't finite, or a zero quaternion. The text names the frame and joint.
+    """
+    r = np.asarray(rotations, dtype=np.float64)
+    p = np.asarray(root, dtype=np.float64)
+    if r.ndim != 3 or r.shape[2] != 4 or p.shape != (len(r), 3) or len(r) == 0:
+        raise MotionError(
+            f"{name}: rotations {r.shape} and root {p.shape}, expected"
+            " [frames, joints, 4] and [frames, 3] with at least one frame."
+        )
+    if not (np.isfinite(fps) and fps > 0):
+        raise MotionError(f"{name}: fps is {fps}, expected a positive number.")
+    bad = ~np.isfinite(r).all(axis=2)
+    bad_root = ~np.isfinite(p).all(axis=1)
+    if bad.any() or bad_root.any():
+        frame, joint = (
+            (int(x) for x in np.argwhere(bad)[0])
+            if bad.any()
+            else (int(np.argmax(bad_root)), 0)
+        )
+        raise MotionError(
+            f"{name}: frame {frame}, joint {joint} is not finite. Cut the frame out or"
+            " interpolate over it."
+        )
+    length = np.linalg.norm(r, axis=2, keepdims=True)
+    if (length < 1e-6).any():
+        frame, joint, _ = (int(x) for x in np.argwhere(length < 1e-6)[0])
+        raise MotionError(
+            f"{name}: frame {frame}, joint {joint} has a zero quaternion; use"
+            " (1, 0, 0, 0) for no rotation."
+        )
+    r = r / length
+    return Motion(
+        jnp.asarray(r.astype(np.float32)),
+        jnp.asarray(p.astype(np.float32)),
+        float(fps),
+        name,
+    )
+
+
+def sample(motion: Motion, times: Float[np.ndarray, " frames"], fps: float) -> Motion:
+    """The motion at given times, by spherical interpolation between its frames.
+
+    Args:
+        motion: A clip.
+        times: Times from its first frame [s]; those outside take the nearest frame.
+        fps: Rate to note in the result [1/s].
+
+    Returns:
+        One frame for each time.
+    """
+    at = np.clip(np.asarray(times) * motion.fps, 0.0, motion.num_frames - 1)
+    low = np.minimum(np.floor(at + 1e-6), motion.num_frames - 1).astype(np.int32)
+    high = np.minimum(low + 1, motion.num_frames - 1).astype(np.int32)
+    t = np.clip(at - low, 0.0, 1.0)
+    q, p = np.asarray(motion.rotations), np.asarray(motion.root)
+    rotations = slerp(q[low], q[high], t[:, None, None])
+    root = p[low] + t[:, None] * (p[high] - p[low])
+    return make_motion(rotations, root, fps, name=motion.name)
+
+
+def resample(motion: Motion, fps: float) -> Motion:
+    """The same motion at another frame rate.
+
+    Args:
+        motion: A clip.
+        fps: Frames a second wanted.
+
+    Returns:
+        The clip from its first frame to its last, or to just before it if the
+        duration isn't a whole number of new frames.
+
+    Raises:
+        MotionError: If ``fps`` isn't positive.
+    """
+    if not (np.isfinite(fps) and fps > 0):
+        raise MotionError(f"fps is {fps}, expected a positive number.")
+    duration = (motion.num_frames - 1) / motion.fps
+    frames = int(np.floor(duration * fps + 1e-6)) + 1
+    return sample(motion, np.arange(frames) / fps, fps)
+
+
+def slerp(
+    a: Float[np.ndarray, "*batch 4"],
+    b: Float[np.ndarray, "*batch 4"],
+    t: Float[np.ndarray, "*#batch 1"],
+) -> Float[np.ndarray, "*batch 4"]:
+    """Spherical interpolation of unit quaternions, the short way round.
+
+    Where both are nearly equal it is normalised linear interpolation (on the host:
+    clips have any length, and each length would be compiled anew).
+    """
+    dot = np.sum(a * b, axis=-1, keepdims=True)
+    b = np.where(dot < 0, -b, b)
+    dot = np.minimum(np.abs(dot), 1.0)
+    near = dot > 0.9995
+    theta = np.arccos(np.where(near, 0.0, dot))
+    sine = np.sin(theta)
+    wa = np.where(near, 1.0 - t, np.sin((1.0 - t) * theta) / sine)
+    wb = np.where(near, t, np.sin(t * theta) / sine)
+    q = wa * a + wb * b
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def body_animation(
+    body: Body, motion: Motion, shape: Float[Array, " shapes"] | None = None
+) -> Float[Array, "frames vertices 3"]:
+    """Body vertices [m] of every frame, one frame at a time to bound memory."""
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    return animate(body, rest, rest[:NUM_BODY_VERTICES], _body_weights(body), motion)
+
+
+def animate(
+    body: Body,
+    rest: Float[Array, "all 3"],
+    vertices: Float[Array, "vertices 3"],
+    weights: Float[Array, "vertices joints"],
+    motion: Motion,
+) -> Float[Array, "frames vertices 3"]:
+    """Any skinned vertices through a clip.
+
+    Clips of any length share one compiled block of frames.
+
+    Args:
+        body: The body.
+        rest: Rest positions of all its vertices, from `Body.rest_vertices` [m].
+        vertices: Rest positions of what is skinned [m].
+        weights: Its skinning weights.
+        motion: The clip.
+
+    Returns:
+        Positions [m] of every frame.
+    """
+    frames = motion.num_frames
+    pick = np.minimum(np.arange(-(-frames // _BLOCK) * _BLOCK), frames - 1)
+    rotations = np.asarray(motion.rotations)[pick].reshape(-1, _BLOCK, *motion.rotations.shape[1:])
+    root = np.asarray(motion.root)[pick].reshape(-1, _BLOCK, 3)
+    blocks = [
+        np.asarray(_animate_block(body, rest, vertices, weights, q, p))
+        for q, p in zip(rotations, root, strict=True)
+    ]
+    return jnp.asarray(np.concatenate(blocks)[:frames])
+
+
+@jax.jit
+def _animate_block(
+    body: Body, rest: Array, vertices: Array, weights: Array, rotations: Array, root: Array
+) -> Array:
+    def one(q: Array, p: Array) -> Array:
+        world, shift = body.transforms(rest, q, p)
+        return linear_blend_skinning(vertices, weights, world, shift)
+
+    return jax.vmap(one)(rotations, root)
+
+
+def _body_weights(body: Body) -> Array:
+    return body.weights[:NUM_BODY_VERTICES]
