@@ -1,6 +1,7 @@
 """Meshes and what can be asked of them. Knows nothing of bodies or garments."""
 
 from ._barycentric import interpolate as interpolate
+from ._candidates import nearby_faces as nearby_faces
 from ._closest import (
     ClosestPoints as ClosestPoints,
     closest_among as closest_among,

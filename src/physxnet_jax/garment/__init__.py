@@ -1,0 +1,15 @@
+"""Garments: templates, fitting and materials. Knows nothing of simulation."""
+
+from ._fit import clearance as clearance, set_clearance as set_clearance
+from ._garment import (
+    COTTON as COTTON,
+    TEMPLATES as TEMPLATES,
+    Fabric as Fabric,
+    Garment as Garment,
+    Template as Template,
+)
+from ._templates import (
+    build_template as build_template,
+    stored_arrays as stored_arrays,
+    template as template,
+)

@@ -1,0 +1,169 @@
+"""Keeping a garment clear of the skin at rest."""
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Float, Int
+
+from ..geometry import (
+    TriMesh,
+    closest_among,
+    mesh_edges,
+    nearby_faces,
+    self_intersections,
+    signed_distance,
+    vertex_normals,
+)
+
+
+def clearance(
+    body: TriMesh, points: Float[np.ndarray, "points 3"]
+) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
+    """Signed distance to the body [m] and the direction away from it.
+
+    The direction is the body's smooth normal at the closest point, which doesn't
+    flip for points inside.
+    """
+    vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
+    p = jnp.asarray(points, jnp.float32)
+    near = nearby_faces(vertices, faces, np.asarray(points))
+    hit = closest_among(body, p, jnp.asarray(near))
+    distance = np.asarray(signed_distance(body, p, closest=hit))
+    normals = np.asarray(vertex_normals(body.vertices, body.faces))
+    tri = faces[np.asarray(hit.face)]
+    away = np.einsum("pk,pkc->pc", np.asarray(hit.weights), normals[tri])
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    return distance, away
+
+
+def set_clearance(
+    body: TriMesh,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    target: Float[np.ndarray, " vertices"],
+    *,
+    free: Float[np.ndarray, " vertices"] | None = None,
+    iterations: int = 12,
+) -> Float[np.ndarray, "vertices 3"]:
+    """The garment moved to a wanted distance from the skin, staying smooth.
+
+    Each pass moves vertices along the skin's normal and smooths the displacement
+    over the mesh, so that wrinkles of the body don't print through.
+
+    Args:
+        body: Closed body mesh.
+        vertices: Garment vertices [m].
+        faces: Garment triangles.
+        target: Wanted distance [m].
+        free: 1 where the garment may be farther away (it hangs), 0 where it is held
+            at the target.
+        iterations: Passes.
+
+    Returns:
+        New positions [m].
+    """
+    v = np.asarray(vertices, dtype=np.float64).copy()
+    loose = np.zeros(len(v)) if free is None else free
+    average = smoothing_matrix(faces, len(v))
+    for step in range(iterations):
+        distance, away = clearance(body, v)
+        missing = target - distance
+        missing = np.where(missing < 0, missing * (1 - loose), missing)
+        move = missing[:, None] * away
+        for _ in range(3 if step < iterations - 3 else 0):
+            move = average @ move
+        v += move
+    return v
+
+
+def bridge_hollows(
+    body: TriMesh,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    farthest: float,
+    iterations: int = 40,
+) -> Float[np.ndarray, "vertices 3"]:
+    """Lets cloth span hollows of the body, as a taut membrane does.
+
+    Vertices move towards their neighbours' mean where that leads away from the skin.
+
+    Args:
+        body: Closed body mesh.
+        vertices: Garment vertices [m].
+        faces: Garment triangles.
+        farthest: No vertex moves beyond this distance from the skin [m].
+        iterations: Passes.
+
+    Returns:
+        New positions [m].
+    """
+    v = np.asarray(vertices, dtype=np.float64).copy()
+    average = smoothing_matrix(faces, len(v))
+    edges = mesh_edges(faces)
+    inner = np.ones(len(v))
+    inner[np.unique(edges.vertices[edges.count == 1])] = 0.0
+    for _ in range(iterations):
+        distance, away = clearance(body, v)
+        step = average @ v - v
+        normals = np.asarray(vertex_normals(jnp.asarray(v, jnp.float32), jnp.asarray(faces)))
+        outwards = np.maximum(np.einsum("vc,vc->v", step, normals), 0.0)
+        # Inside a deep fold the skin's own normals cross: there the cloth's decide.
+        room = np.clip((farthest - distance) / 0.002, 0.0, 1.0)
+        along = np.where((np.einsum("vc,vc->v", away, normals) > 0.0)[:, None], 1.0, 0.5)
+        v += (inner * room * outwards)[:, None] * normals * along
+    return v
+
+
+def relax_crossings(
+    body: TriMesh,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    *,
+    nearest: float = 0.006,
+    rounds: int = 12,
+) -> Float[np.ndarray, "vertices 3"]:
+    """Smooths the cloth where it crosses itself until it no longer does.
+
+    Args:
+        body: Closed body mesh.
+        vertices: Garment vertices [m].
+        faces: Garment triangles.
+        nearest: Smoothed vertices stay this far from the skin [m].
+        rounds: Attempts; each widens the smoothed region by one ring.
+
+    Returns:
+        New positions [m]; crossings may remain, see `self_intersections`.
+    """
+    v = np.asarray(vertices, dtype=np.float64).copy()
+    average = smoothing_matrix(faces, len(v))
+    edges = mesh_edges(faces).vertices
+    for attempt in range(rounds):
+        pairs = self_intersections(v, faces)
+        if len(pairs) == 0:
+            break
+        region = np.zeros(len(v))
+        region[edges[pairs[:, 0]].ravel()] = 1.0
+        region[faces[pairs[:, 1]].ravel()] = 1.0
+        for _ in range(2 + attempt):
+            region = (average @ region > 0).astype(float)
+        for _ in range(20):
+            v += region[:, None] * (average @ v - v)
+        for _ in range(4):
+            lack = np.maximum(nearest - clearance(body, v)[0], 0.0) * (region > 0)
+            normals = vertex_normals(jnp.asarray(v, jnp.float32), jnp.asarray(faces))
+            v += lack[:, None] * np.asarray(normals)
+    return v
+
+
+def smoothing_matrix(
+    faces: Int[np.ndarray, "faces 3"], num_vertices: int
+) -> sp.csr_matrix:
+    """Averages each vertex with its neighbours, half and half."""
+    e = mesh_edges(faces).vertices
+    ones = np.ones(len(e))
+    graph = sp.csr_matrix((ones, (e[:, 0], e[:, 1])), (num_vertices, num_vertices))
+    graph = graph + graph.T
+    degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1)
+    eye = sp.identity(num_vertices, format="csr")
+    return sp.csr_matrix(0.5 * eye + 0.5 * sp.diags(1 / degree) @ graph)

@@ -1,0 +1,35 @@
+"""Short lists of faces near points, from a k-d tree on the host."""
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
+
+from ._topology import vertex_faces
+
+
+def nearby_faces(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    points: Float[np.ndarray, "points 3"],
+    *,
+    neighbours: int = 6,
+) -> Int[np.ndarray, "points k"]:
+    """Faces around the mesh vertices nearest to each point.
+
+    Enough for `closest_among` on meshes without long thin triangles: the closest
+    face nearly always touches one of the nearest vertices.
+
+    Args:
+        vertices: Mesh vertices [m].
+        faces: Mesh faces.
+        points: Query points [m].
+        neighbours: Nearest vertices whose faces are taken.
+
+    Returns:
+        Face indices, with repetitions where a vertex has few faces.
+    """
+    around = vertex_faces(faces, len(vertices))
+    used = np.unique(faces)
+    k = min(neighbours, len(used))
+    near = cKDTree(vertices[used]).query(points, k=k)[1].reshape(len(points), k)
+    return around[used[near]].reshape(len(points), -1)
