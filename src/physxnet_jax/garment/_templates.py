@@ -22,7 +22,7 @@ _HEM_TOP = -0.03
 _ANKLE = -0.70
 _NECK = 0.535
 _DRESS_WAIST = 0.115
-_DRESS_NECK = 0.50
+_DRESS_NECK = 0.533
 _DRESS_HEM = -0.45
 _SHORT_SLEEVE = 0.5
 _SKIRT_ROW = 0.019
@@ -67,7 +67,7 @@ def build_template(name: Template, body: Body | None = None) -> Garment:
         fabric = COTTON
     elif name == "dress":
         piece = _keep(rows, faces, rest, lambda p: _DRESS_WAIST - p[:, 1], body=body)
-        piece = _keep(piece.rows, piece.faces, rest, lambda p: _neck(p, 0.6) - _DRESS_NECK)
+        piece = _keep(piece.rows, piece.faces, rest, lambda p: _neck(p, 0.4) - _DRESS_NECK)
         piece = _short_sleeves(piece, rest, body)
         piece = _weld_skirt(piece, rest, body)
         fabric = COTTON

@@ -1,0 +1,98 @@
+"""Garments of a scene as one set of particles and triangles."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..body import Body
+from ..garment import Garment
+from ..geometry import connected_components
+
+
+@dataclasses.dataclass(frozen=True)
+class Assembly:
+    """What effects are built from. Host arrays, made once for a scene.
+
+    Attributes:
+        body: The body worn on.
+        rest_body: Rest positions of all body vertices [m], shape [all, 3].
+        rest: Rest positions of cloth vertices [m], shape [vertices, 3].
+        faces: Cloth triangles, shape [faces, 3].
+        mass: Vertex masses [kg], shape [vertices].
+        pinned: Vertices that follow the skin, shape [vertices].
+        weights: Skinning weights of cloth vertices, shape [vertices, joints].
+        thickness: Gap kept to the skin [m], shape [vertices].
+        friction: Coulomb coefficient [1], shape [vertices].
+        stretch: Membrane stiffness of faces [N/m], shape [faces].
+        bend: Bending stiffness of faces [N m], shape [faces].
+        loose: Vertices that may meet any limb (skirts), shape [vertices].
+        parts: First vertex of every garment, and the total at the end.
+    """
+
+    body: Body
+    rest_body: Float[np.ndarray, "all 3"]
+    rest: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    mass: Float[np.ndarray, " vertices"]
+    pinned: Bool[np.ndarray, " vertices"]
+    weights: Float[np.ndarray, "vertices joints"]
+    thickness: Float[np.ndarray, " vertices"]
+    friction: Float[np.ndarray, " vertices"]
+    stretch: Float[np.ndarray, " faces"]
+    bend: Float[np.ndarray, " faces"]
+    loose: Bool[np.ndarray, " vertices"]
+    parts: tuple[int, ...]
+
+
+def assemble(
+    garments: tuple[Garment, ...], body: Body, shape: Float[Array, " shapes"]
+) -> Assembly:
+    """Garments at rest on a body, as one system."""
+    rest_body = body.rest_vertices(shape)
+    skin = np.asarray(body.weights, dtype=np.float64)
+    rest, faces, mass, pinned, weights = [], [], [], [], []
+    per_vertex: dict[str, list] = {"thickness": [], "friction": []}
+    per_face: dict[str, list] = {"stretch": [], "bend": []}
+    loose = []
+    parts = [0]
+    for g in garments:
+        x = np.asarray(g.rest_vertices(rest_body), dtype=np.float64)
+        f = np.asarray(g.mesh.faces)
+        area = 0.5 * np.linalg.norm(
+            np.cross(x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]]), axis=1
+        )
+        m = np.zeros(len(x))
+        np.add.at(m, f, (g.fabric.density * area / 3)[:, None])
+        # A vertex without area still needs a mass: a thousandth of the mean one.
+        m = np.maximum(m, 1e-3 * max(float(m.mean()), 1e-9))
+        w = np.einsum("vk,vkj->vj", np.asarray(g.ref_weights, np.float64), skin[np.asarray(g.refs)])
+        rest.append(x)
+        faces.append(f + parts[-1])
+        mass.append(m)
+        pinned.append(np.asarray(g.pinned))
+        weights.append(w / np.maximum(w.sum(axis=1, keepdims=True), 1e-9))
+        per_vertex["thickness"].append(np.full(len(x), g.fabric.thickness))
+        per_vertex["friction"].append(np.full(len(x), g.fabric.friction))
+        per_face["stretch"].append(np.full(len(f), g.fabric.stretch))
+        per_face["bend"].append(np.full(len(f), g.fabric.bend))
+        loose.append(np.full(len(x), g.template == "dress"))
+        parts.append(parts[-1] + len(x))
+    cat = np.concatenate
+    return Assembly(
+        body, np.asarray(rest_body, np.float64), cat(rest), cat(faces), cat(mass),
+        cat(pinned), cat(weights), cat(per_vertex["thickness"]),
+        cat(per_vertex["friction"]), cat(per_face["stretch"]), cat(per_face["bend"]),
+        cat(loose), tuple(parts),
+    )
+
+
+def cloth_components(assembly: Assembly) -> Int[np.ndarray, " vertices"]:
+    """Component of every cloth vertex."""
+    return connected_components(assembly.faces, len(assembly.rest))
+
+
+def float32(x: np.ndarray) -> Array:
+    """A device array in the simulation's precision."""
+    return jnp.asarray(np.asarray(x, dtype=np.float32))

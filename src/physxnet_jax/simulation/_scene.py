@@ -1,0 +1,69 @@
+"""Scenes: garments on a body, and the effects that act."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..body import Body, load_body
+from ..errors import SimulationError
+from ..garment import Garment
+from ._assembly import Assembly, assemble
+from ._effect import Effect, Prepared
+from .effects import Bend, BodyContact, Damping, Gravity, Pin, Stretch
+
+STANDARD: tuple[Effect, ...] = (
+    Gravity(), Damping(), Stretch(), Bend(), BodyContact(), Pin(),
+)
+"""What clothes on a moving person call for, in the order they are applied."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Scene:
+    """Garments worn on a body.
+
+    Attributes:
+        garments: What is worn. Garments don't touch each other here.
+        effects: What acts, in this order within a substep. An effect that isn't
+            listed isn't computed.
+        body: The body; the built-in one if None.
+        shape: Its shape parameters; the default if None.
+    """
+
+    garments: tuple[Garment, ...]
+    effects: tuple[Effect, ...] = STANDARD
+    body: Body | None = None
+    shape: Float[Array, " shapes"] | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class PreparedScene:
+    """A scene ready to roll: host tables and device arrays."""
+
+    assembly: Assembly
+    effects: tuple[Prepared, ...]
+
+
+def prepare_scene(scene: Scene) -> PreparedScene:
+    """Builds everything a rollout needs, once.
+
+    Raises:
+        SimulationError: No garment, or the same effect twice.
+    """
+    if not scene.garments:
+        raise SimulationError("A scene needs a garment; garments is empty.")
+    kinds = [type(e) for e in scene.effects]
+    if len(set(kinds)) != len(kinds):
+        raise SimulationError(
+            f"An effect is listed twice: {[k.__name__ for k in kinds]}. List each once."
+        )
+    body = load_body() if scene.body is None else scene.body
+    shape = body.default_shape() if scene.shape is None else scene.shape
+    assembly = assemble(scene.garments, body, shape)
+    # Pinned vertices weigh infinitely much only where something pins them.
+    held = assembly.pinned if Pin in kinds else np.zeros_like(assembly.pinned)
+    inverse = np.where(held, 0.0, 1.0 / assembly.mass)
+    inverse_mass = jnp.asarray(inverse.astype(np.float32))
+    prepared = tuple(e.prepare(assembly, inverse_mass) for e in scene.effects)
+    return PreparedScene(assembly, prepared)

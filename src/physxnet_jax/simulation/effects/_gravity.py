@@ -1,0 +1,33 @@
+"""Gravity: a constant acceleration."""
+
+import dataclasses
+
+import jax
+from jaxtyping import Array
+
+from .._assembly import Assembly
+from .._effect import Effect, Prepared
+
+
+@dataclasses.dataclass(frozen=True)
+class Gravity(Effect):
+    """``a = (0, -g, 0)``.
+
+    Attributes:
+        g: Acceleration downwards [m/s^2].
+    """
+
+    g: float = 9.81
+
+    def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
+        """Pinned vertices fall too; their pins put them back."""
+        return _Gravity(self.g)
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class _Gravity(Prepared):
+    g: float = dataclasses.field(metadata={"static": True})
+
+    def accelerate(self, velocity: Array, h: float) -> Array:
+        return velocity.at[:, 1].add(-self.g * h)
