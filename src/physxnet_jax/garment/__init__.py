@@ -7,6 +7,7 @@ from ._garment import (
     Fabric as Fabric,
     Garment as Garment,
     Template as Template,
+    carried_weights as carried_weights,
 )
 from ._templates import (
     build_template as build_template,

@@ -48,6 +48,7 @@ class Garment:
         refs: Body (helper) vertices that carry each vertex, shape [vertices, k].
         ref_weights: Their weights, rows sum to 1, shape [vertices, k].
         offset: What is added to their weighted mean [m], shape [vertices, 3].
+        skin: Skinning weights, rows sum to 1, shape [vertices, joints].
         fabric: Material.
         template: The map this garment is dressed by.
         name: Name used in tables and files.
@@ -58,6 +59,7 @@ class Garment:
     refs: Int[Array, "vertices k"]
     ref_weights: Float[Array, "vertices k"]
     offset: Float[Array, "vertices 3"]
+    skin: Float[Array, "vertices joints"]
     fabric: Fabric = dataclasses.field(metadata={"static": True})
     template: Template = dataclasses.field(metadata={"static": True})
     name: str = dataclasses.field(metadata={"static": True})
@@ -81,3 +83,13 @@ class Garment:
         """
         carried = rest[self.refs] * self.ref_weights[:, :, None]
         return jnp.sum(carried, axis=1) + self.offset
+
+
+def carried_weights(
+    body_weights: Float[Array, "all joints"],
+    refs: Int[Array, "vertices k"],
+    ref_weights: Float[Array, "vertices k"],
+) -> Float[Array, "vertices joints"]:
+    """Skinning weights of vertices carried by body vertices, rows summing to 1."""
+    mixed = jnp.sum(body_weights[refs] * ref_weights[:, :, None], axis=1)
+    return mixed / jnp.sum(mixed, axis=1, keepdims=True)

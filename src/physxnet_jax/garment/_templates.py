@@ -14,7 +14,7 @@ from ..errors import MeshError
 from ..geometry import TriMesh, boundary_loops, cast_rays, make_mesh, vertex_normals
 from ._cut import cut, pad_rows, refine, split_quads
 from ._fit import bridge_hollows, relax_crossings, set_clearance
-from ._garment import COTTON, TEMPLATES, Fabric, Garment, Template
+from ._garment import COTTON, TEMPLATES, Fabric, Garment, Template, carried_weights
 
 # Heights on the default shape [m]; y = 0 lies in the pelvis.
 _WAIST = 0.10
@@ -85,7 +85,7 @@ def build_template(name: Template, body: Body | None = None) -> Garment:
         loops = boundary_loops(piece.faces)
         waist = max(loops, key=lambda loop: vertices[loop, 1].mean())
         pinned[waist] = True
-    return _assemble(name, piece, vertices, vertices - start, pinned, fabric)
+    return _assemble(name, piece, vertices, vertices - start, pinned, fabric, body)
 
 
 @functools.cache
@@ -103,12 +103,15 @@ def template(name: Template) -> Garment:
         part = {k: data[f"{name}_{k}"] for k in _STORED}
     fabric = Fabric(*(float(x) for x in part["fabric"]))
     mesh = make_mesh(part["vertices"], part["faces"], part["uv"], name=name)
+    refs = jnp.asarray(part["refs"].astype(np.int32))
+    weights = jnp.asarray(part["ref_weights"])
     return Garment(
         mesh,
         jnp.asarray(part["pinned"]),
-        jnp.asarray(part["refs"].astype(np.int32)),
-        jnp.asarray(part["ref_weights"]),
+        refs,
+        weights,
         jnp.asarray(part["offset"]),
+        carried_weights(load_body().weights, refs, weights),
         fabric,
         name,
         name,
@@ -142,6 +145,7 @@ def _assemble(
     offset: Float[np.ndarray, "vertices 3"],
     pinned: np.ndarray,
     fabric: Fabric,
+    body: Body,
 ) -> Garment:
     index, weight = pad_rows(piece.rows)
     mesh = make_mesh(vertices, piece.faces, _cylinder_uv(vertices), name=name)
@@ -151,6 +155,7 @@ def _assemble(
         jnp.asarray(index),
         jnp.asarray(weight),
         jnp.asarray(offset.astype(np.float32)),
+        carried_weights(body.weights, jnp.asarray(index), jnp.asarray(weight)),
         fabric,
         name,
         name,

@@ -51,7 +51,6 @@ def assemble(
 ) -> Assembly:
     """Garments at rest on a body, as one system."""
     rest_body = body.rest_vertices(shape)
-    skin = np.asarray(body.weights, dtype=np.float64)
     rest, faces, mass, pinned, weights = [], [], [], [], []
     per_vertex: dict[str, list] = {"thickness": [], "friction": []}
     per_face: dict[str, list] = {"stretch": [], "bend": []}
@@ -67,12 +66,11 @@ def assemble(
         np.add.at(m, f, (g.fabric.density * area / 3)[:, None])
         # A vertex without area still needs a mass: a thousandth of the mean one.
         m = np.maximum(m, 1e-3 * max(float(m.mean()), 1e-9))
-        w = np.einsum("vk,vkj->vj", np.asarray(g.ref_weights, np.float64), skin[np.asarray(g.refs)])
         rest.append(x)
         faces.append(f + parts[-1])
         mass.append(m)
         pinned.append(np.asarray(g.pinned))
-        weights.append(w / np.maximum(w.sum(axis=1, keepdims=True), 1e-9))
+        weights.append(np.asarray(g.skin, dtype=np.float64))
         per_vertex["thickness"].append(np.full(len(x), g.fabric.thickness))
         per_vertex["friction"].append(np.full(len(x), g.fabric.friction))
         per_face["stretch"].append(np.full(len(f), g.fabric.stretch))

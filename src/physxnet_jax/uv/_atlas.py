@@ -1,0 +1,179 @@
+"""The atlas: the body's uv chart without face, hands and feet, filling the square."""
+
+import dataclasses
+import functools
+import hashlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..body import NUM_BODY_VERTICES, Body, load_body
+from ..geometry import connected_components
+from ._rasterise import rasterise
+from ._transference import Transference
+
+_LEFT_OUT = (
+    ("Head", "Neck1"),
+    ("LeftHand", "LThumb", "LeftFingerBase", "LeftHandFinger1"),
+    ("RightHand", "RThumb", "RightFingerBase", "RightHandFinger1"),
+    ("LeftFoot", "LeftToeBase"),
+    ("RightFoot", "RightToeBase"),
+)
+# Share of the height over which the chart's outline is smoothed before stretching.
+_SMOOTH = 0.05
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Atlas:
+    """Texels of the clothed part of the body.
+
+    Attributes:
+        texels: Covered texels in row-major order as flat indices, shape [texels].
+        to_body: T_UB, body vertices to texels, rows as ``texels``.
+        uv: Texture coordinates in the atlas, shape [uvs, 2].
+        faces: Body faces in the chart, vertex indices, shape [faces, 3].
+        uv_faces: Their corners in ``uv``, shape [faces, 3].
+        height: Rows of a map.
+        width: Columns of a map.
+        used_before: Share of texels the whole chart's clothed part covers as it is.
+    """
+
+    texels: Int[Array, " texels"]
+    to_body: Transference
+    uv: Float[Array, "uvs 2"]
+    faces: Int[Array, "faces 3"]
+    uv_faces: Int[Array, "faces 3"]
+    height: int = dataclasses.field(metadata={"static": True})
+    width: int = dataclasses.field(metadata={"static": True})
+    used_before: float = dataclasses.field(metadata={"static": True})
+
+    @property
+    def num_texels(self) -> int:
+        """Number of covered texels."""
+        return self.texels.shape[0]
+
+    @property
+    def used(self) -> float:
+        """Share of texels covered."""
+        return self.num_texels / (self.height * self.width)
+
+    @property
+    def mask(self) -> Bool[Array, "height width"]:
+        """Which texels are covered."""
+        flat = jnp.zeros((self.height * self.width,), bool).at[self.texels].set(True)
+        return flat.reshape(self.height, self.width)
+
+    def to_map(
+        self, values: Float[Array, "*batch texels channels"]
+    ) -> Float[Array, "*batch height width channels"]:
+        """Values of covered texels as maps, zero elsewhere."""
+        *batch, _, channels = values.shape
+        flat = jnp.zeros((*batch, self.height * self.width, channels), values.dtype)
+        flat = flat.at[..., self.texels, :].set(values, unique_indices=True)
+        return flat.reshape(*batch, self.height, self.width, channels)
+
+    def from_map(
+        self, maps: Float[Array, "*batch height width channels"]
+    ) -> Float[Array, "*batch texels channels"]:
+        """Values of the covered texels of maps."""
+        *batch, height, width, channels = maps.shape
+        return maps.reshape(*batch, height * width, channels)[..., self.texels, :]
+
+    def digest(self) -> str:
+        """A hash of what the texels mean; weights are tied to it."""
+        h = hashlib.sha256(f"{self.height}x{self.width}".encode())
+        h.update(np.asarray(self.texels).tobytes())
+        h.update(np.asarray(self.to_body.vertices).tobytes())
+        # Weights are rounded: compilers may differ in the last bits.
+        h.update(np.round(np.asarray(self.to_body.weights), 3).astype(np.float32).tobytes())
+        return h.hexdigest()[:16]
+
+
+def make_atlas(
+    resolution: int | tuple[int, int] = 256, body: Body | None = None
+) -> Atlas:
+    """The atlas of a size.
+
+    The torso and limbs chart is cropped to its bounding box and stretched row by row
+    towards the square's sides, by its smoothed outline.
+
+    Args:
+        resolution: Texels a side, or (height, width).
+        body: The body; the built-in one by default.
+
+    Returns:
+        The atlas. ``used_before`` and ``used`` tell what the stretching gained.
+
+    References:
+        PhysXNet, section 4.2: face, hands and feet are removed, limbs stretched.
+    """
+    size = (resolution, resolution) if isinstance(resolution, int) else resolution
+    if body is None:
+        return _cached_atlas(*size)
+    return _make_atlas(size, body)
+
+
+@functools.cache
+def _cached_atlas(height: int, width: int) -> Atlas:
+    return _make_atlas((height, width), load_body())
+
+
+def _make_atlas(size: tuple[int, int], body: Body) -> Atlas:
+    height, width = size
+    mesh = body.rest_mesh()
+    faces, uv_faces = np.asarray(mesh.faces), np.asarray(mesh.uv_faces)
+    uv = np.asarray(mesh.uv, dtype=np.float64)
+    weights = np.asarray(body.weights)[:NUM_BODY_VERTICES]
+    left_out = np.stack(
+        [weights[:, [body.joint(n) for n in names]].sum(axis=1) for names in _LEFT_OUT]
+    ).max(axis=0)
+    keep = left_out[faces].mean(axis=1) <= 0.5
+    # One chart holds the torso and limbs; crumbs of others are dropped.
+    chart = connected_components(uv_faces, len(uv))[uv_faces[:, 0]]
+    keep &= chart == np.bincount(chart[keep]).argmax()
+    faces, uv_faces = faces[keep], uv_faces[keep]
+    before = len(rasterise(uv, uv_faces, height, width)[0]) / (height * width)
+    stretched = _stretch(uv, uv_faces)
+    texels, own, bary = rasterise(stretched, uv_faces, height, width)
+    transference = Transference(
+        jnp.asarray(faces[own].astype(np.int32)),
+        jnp.asarray(bary.astype(np.float32)),
+        jnp.ones((len(own),), bool),
+    )
+    return Atlas(
+        jnp.asarray(texels),
+        transference,
+        jnp.asarray(stretched.astype(np.float32)),
+        jnp.asarray(faces.astype(np.int32)),
+        jnp.asarray(uv_faces.astype(np.int32)),
+        height,
+        width,
+        before,
+    )
+
+
+def _stretch(
+    uv: Float[np.ndarray, "uvs 2"], uv_faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "uvs 2"]:
+    """The chart cropped, then each row widened to the outline's smoothed reach."""
+    used = np.unique(uv_faces)
+    low, high = uv[used].min(axis=0), uv[used].max(axis=0)
+    out = (uv - low) / (high - low)
+    levels = np.linspace(0.0, 1.0, 201)
+    x, y = np.abs(out[used, 0] - 0.5), out[used, 1]
+    reach = np.asarray(
+        [x[np.abs(y - v) <= _SMOOTH].max(initial=0.05) for v in levels]
+    )
+    # The running maximum keeps everything inside; the mean keeps the map smooth.
+    kernel = np.ones(2 * int(_SMOOTH * 200 / 2) + 1)
+    kernel /= kernel.sum()
+    half = len(kernel) // 2
+    smooth = np.convolve(np.pad(reach, half, mode="edge"), kernel, mode="valid")
+    wide = np.interp(out[:, 1], levels, smooth)
+    margin = 0.998
+    out[:, 0] = 0.5 + 0.5 * margin * (out[:, 0] - 0.5) / wide
+    out[:, 1] = 0.5 + margin * (out[:, 1] - 0.5)
+    return np.clip(out, 0.0, 1.0)
