@@ -1,0 +1,26 @@
+"""Networks and the predictor built on them. Knows nothing of losses or files."""
+
+from ._blocks import depth_to_space as depth_to_space, upsampling_kernel as upsampling_kernel
+from ._features import (
+    WINDOW as WINDOW,
+    Family as Family,
+    motion_features as motion_features,
+    num_channels as num_channels,
+    skin_points as skin_points,
+)
+from ._networks import Discriminator as Discriminator, Generator as Generator
+from ._predictor import (
+    ModelConfig as ModelConfig,
+    Normalisation as Normalisation,
+    Predictor as Predictor,
+    Surface as Surface,
+    Wearable as Wearable,
+    apply_offsets as apply_offsets,
+    dress_windows as dress_windows,
+    make_generator as make_generator,
+    make_surface as make_surface,
+    make_wearable as make_wearable,
+    network_input as network_input,
+    pose_windows as pose_windows,
+    skin_wearable as skin_wearable,
+)

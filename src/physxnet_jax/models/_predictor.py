@@ -1,0 +1,308 @@
+"""The predictor: network, normalisation and atlas as one, and dressing as a function."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from jaxtyping import Array, Bool, Float
+
+from ..body import Body
+from ..garment import Garment
+from ..geometry import polar_rotation
+from ..uv import Atlas, Binding, dress_body
+from ._features import WINDOW, Family, motion_features, num_channels, skin_points
+from ._networks import Generator
+
+_EXACT = jax.lax.Precision.HIGHEST
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """Everything that decides what a network is.
+
+    Attributes:
+        family: ``paper`` (world frame) or ``local`` (each texel's own frame).
+        resolution: Texels a side, a multiple of 16.
+        width: Channels of the first layer.
+        templates: Templates with a decoder.
+        dtype: Arithmetic of the network, ``float32`` or ``bfloat16``.
+    """
+
+    family: Family = "local"
+    resolution: int = 128
+    width: int = 32
+    templates: tuple[str, ...] = ("top", "bottom", "dress")
+    dtype: str = "float32"
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Normalisation:
+    """Scales that bring each kind of map to [-1, 1], from the training set.
+
+    Attributes:
+        velocity: [m/s].
+        acceleration: [m/s^2].
+        offset: Of each template [m].
+    """
+
+    velocity: Float[Array, ""]
+    acceleration: Float[Array, ""]
+    offset: dict[str, Float[Array, ""]]
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Surface:
+    """The texels of an atlas on a body shape.
+
+    Attributes:
+        rest: Texel points at rest [m], shape [texels, 3].
+        rest_dress: The same on the body with joined legs.
+        weights: Skinning weights, shape [texels, joints].
+        valid: Texels that each template covers, shape [texels].
+    """
+
+    rest: Float[Array, "texels 3"]
+    rest_dress: Float[Array, "texels 3"]
+    weights: Float[Array, "texels joints"]
+    valid: dict[str, Bool[Array, " texels"]]
+
+
+def make_surface(
+    atlas: Atlas,
+    body: Body,
+    rest: Float[Array, "all 3"],
+    valid: dict[str, Bool[Array, " texels"]],
+) -> Surface:
+    """Texels on a body shape.
+
+    Args:
+        atlas: The atlas.
+        body: The body.
+        rest: Its rest vertices [m].
+        valid: Texels that each template covers.
+    """
+    joined = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
+    return Surface(
+        atlas.to_body @ rest, atlas.to_body @ joined, atlas.to_body @ body.weights, valid
+    )
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Predictor:
+    """A trained network with all it needs to answer.
+
+    Attributes:
+        atlas: The atlas whose texels it speaks of.
+        surface: Those texels on a body.
+        normalisation: Scales of its inputs and outputs.
+        state: Parameters and statistics of the network.
+        graph: Structure of the network.
+        config: What the network is.
+    """
+
+    atlas: Atlas
+    surface: Surface
+    normalisation: Normalisation
+    state: nnx.State
+    graph: nnx.GraphDef = dataclasses.field(metadata={"static": True})
+    config: ModelConfig = dataclasses.field(metadata={"static": True})
+
+    def __call__(
+        self,
+        rotations: Float[Array, "batch window joints 3 3"],
+        translations: Float[Array, "batch window joints 3"],
+        fps: float,
+        templates: Sequence[str],
+    ) -> dict[str, Float[Array, "batch texels 3"]]:
+        """Offsets of the last frame of each window of poses [m].
+
+        ``local``: the change of the offset at rest, in each cloth point's own frame.
+        ``paper``: the offset from skin to cloth, in the world's frame. Only the
+        decoders of ``templates`` are computed.
+
+        Args:
+            rotations: World rotations of joints, oldest frame first.
+            translations: World translations of joints [m].
+            fps: Frames a second.
+            templates: Which maps.
+
+        Returns:
+            Offsets of covered texels; zero where the template doesn't reach.
+        """
+        features = network_input(
+            self.surface, self.normalisation, rotations, translations, fps, self.config.family
+        )
+        return self.from_features(features, templates)
+
+    def from_features(
+        self, features: Float[Array, "batch texels channels"], templates: Sequence[str]
+    ) -> dict[str, Float[Array, "batch texels 3"]]:
+        """Offsets [m] from normalised features, see `network_input`."""
+        network = nnx.merge(self.graph, self.state)
+        network.eval()
+        maps = self.atlas.to_map(features).astype(jnp.dtype(self.config.dtype))
+        out = network(maps, tuple(templates))
+        return {
+            t: jnp.where(
+                self.surface.valid[t][None, :, None],
+                self.atlas.from_map(m).astype(jnp.float32) * self.normalisation.offset[t],
+                0.0,
+            )
+            for t, m in out.items()
+        }
+
+
+def network_input(
+    surface: Surface,
+    normalisation: Normalisation,
+    rotations: Float[Array, "batch window joints 3 3"],
+    translations: Float[Array, "batch window joints 3"],
+    fps: float,
+    family: Family,
+) -> Float[Array, "batch texels channels"]:
+    """Normalised features of windows of poses (PhysXNet, section 4.3)."""
+    features = jax.vmap(motion_features, in_axes=(None, None, 0, 0, None, None))(
+        surface.rest, surface.weights, rotations, translations, fps, family
+    )
+    ones = jnp.ones((9,), jnp.float32)
+    scale = [ones / normalisation.velocity, ones / normalisation.acceleration]
+    if family == "local":
+        scale.append(jnp.ones((3,), jnp.float32))
+    return features * jnp.concatenate(scale)[None, None]
+
+
+def make_generator(config: ModelConfig, *, seed: int = 0) -> Generator:
+    """A generator with fresh parameters."""
+    return Generator(
+        num_channels(config.family), config.templates, width=config.width,
+        rngs=nnx.Rngs(seed),
+    )
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Wearable:
+    """A garment bound to an atlas, on a body shape: all that dressing needs.
+
+    Attributes:
+        rest: Garment vertices at rest [m], shape [vertices, 3].
+        skin: Their skinning weights, shape [vertices, joints].
+        binding: Texels they sample and body points they belong to.
+        anchor: Body points at rest that the binding names [m], shape [vertices, 3].
+        anchor_weights: Their skinning weights, shape [vertices, joints].
+        template: The map this garment is dressed by.
+        name: Name of the garment.
+    """
+
+    rest: Float[Array, "vertices 3"]
+    skin: Float[Array, "vertices joints"]
+    binding: Binding
+    anchor: Float[Array, "vertices 3"]
+    anchor_weights: Float[Array, "vertices joints"]
+    template: str = dataclasses.field(metadata={"static": True})
+    name: str = dataclasses.field(metadata={"static": True})
+
+
+def make_wearable(
+    body: Body, rest: Float[Array, "all 3"], garment: Garment, binding: Binding
+) -> Wearable:
+    """A garment ready to be dressed on a body shape."""
+    base = rest
+    if garment.template == "dress":
+        base = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
+    return Wearable(
+        garment.rest_vertices(rest),
+        garment.skin,
+        binding,
+        binding.to_body @ base,
+        binding.to_body @ body.weights,
+        garment.template,
+        garment.name,
+    )
+
+
+def skin_wearable(
+    wearable: Wearable,
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+) -> Float[Array, "vertices 3"]:
+    """The garment by linear blend skinning alone [m]: the baseline."""
+    return skin_points(wearable.rest, wearable.skin, rotations, translations)[0]
+
+
+def apply_offsets(
+    wearable: Wearable,
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+    offsets: Float[Array, "texels 3"],
+    family: Family,
+) -> Float[Array, "vertices 3"]:
+    """Garment vertices [m] in a pose, from a predicted map.
+
+    Args:
+        wearable: The garment.
+        rotations: World rotations of joints.
+        translations: World translations of joints [m].
+        offsets: Predicted offsets of covered texels [m].
+        family: How to read them, see `Predictor`.
+
+    Returns:
+        Vertex positions. With zero offsets, ``local`` gives exactly the skinning.
+
+    References:
+        PhysXNet, equation 3 and section 4.3.
+    """
+    sampled = wearable.binding.sample(offsets)
+    if family == "paper":
+        points, _ = skin_points(
+            wearable.anchor, wearable.anchor_weights, rotations, translations
+        )
+        return points + sampled
+    points, blend = skin_points(wearable.rest, wearable.skin, rotations, translations)
+    turned = jnp.einsum("vab,vb->va", polar_rotation(blend), sampled, precision=_EXACT)
+    return points + turned
+
+
+def dress_windows(
+    predictor: Predictor,
+    wearables: Sequence[Wearable],
+    rotations: Float[Array, "batch window joints 3 3"],
+    translations: Float[Array, "batch window joints 3"],
+    fps: float,
+) -> tuple[Float[Array, "batch vertices 3"], ...]:
+    """Dressed garments [m] in the last frame of each window; pure, differentiable.
+
+    Args:
+        predictor: The network.
+        wearables: What is worn.
+        rotations: World rotations of joints, oldest frame first.
+        translations: World translations of joints [m].
+        fps: Frames a second.
+
+    Returns:
+        Positions of each garment.
+    """
+    templates = tuple(dict.fromkeys(w.template for w in wearables))
+    offsets = predictor(rotations, translations, fps, templates)
+    family = predictor.config.family
+    return tuple(
+        jax.vmap(lambda r, t, o, w=w: apply_offsets(w, r, t, o, family))(
+            rotations[:, -1], translations[:, -1], offsets[w.template]
+        )
+        for w in wearables
+    )
+
+
+def pose_windows(
+    values: Float[Array, "frames ..."] | Float[np.ndarray, "frames ..."],
+) -> Float[Array, "frames window ..."] | Float[np.ndarray, "frames window ..."]:
+    """The last five frames up to each frame; the first one is repeated before itself."""
+    frames = values.shape[0]
+    index = np.arange(frames)[:, None] + np.arange(1 - WINDOW, 1)[None]
+    return values[np.maximum(index, 0)]

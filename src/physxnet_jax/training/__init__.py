@@ -1,0 +1,19 @@
+"""Training: losses, step, loop, checkpoints."""
+
+from ._batches import (
+    Frames as Frames,
+    batch_indices as batch_indices,
+    load_frames as load_frames,
+    motion_transforms as motion_transforms,
+    usable_garment as usable_garment,
+)
+from ._checkpoint import Checkpoints as Checkpoints
+from ._config import TrainConfig as TrainConfig
+from ._loop import prepare_surface as prepare_surface, train as train
+from ._losses import (
+    adversarial_loss as adversarial_loss,
+    discriminator_loss as discriminator_loss,
+    masked_l1 as masked_l1,
+    soft_labels as soft_labels,
+)
+from ._step import ClothTables as ClothTables, TrainState as TrainState, make_step as make_step

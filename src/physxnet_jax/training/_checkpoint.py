@@ -1,0 +1,63 @@
+"""Checkpoints through orbax: the whole state, resumed exactly."""
+
+import dataclasses
+import json
+import pathlib
+from typing import Any
+
+import jax
+import orbax.checkpoint as ocp
+
+from ._step import TrainState
+
+
+class Checkpoints:
+    """The checkpoints of one run.
+
+    Args:
+        folder: Where they lie; made if absent.
+        keep: How many of the newest are kept.
+    """
+
+    def __init__(self, folder: str | pathlib.Path, *, keep: int = 2) -> None:
+        self._manager = ocp.CheckpointManager(
+            pathlib.Path(folder).absolute(),
+            options=ocp.CheckpointManagerOptions(
+                max_to_keep=keep, create=True, enable_async_checkpointing=False
+            ),
+        )
+
+    def save(self, state: TrainState, info: dict[str, Any]) -> None:
+        """Saves a state under its step number; whole or not at all."""
+        self._manager.save(
+            int(state.step),
+            args=ocp.args.Composite(
+                state=ocp.args.StandardSave(_plain(state)), info=ocp.args.JsonSave(info)
+            ),
+        )
+        self._manager.wait_until_finished()
+
+    def latest(self, like: TrainState) -> TrainState | None:
+        """The newest state, shaped as ``like``; None if there is none."""
+        step = self._manager.latest_step()
+        if step is None:
+            return None
+        abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, _plain(like))
+        got = self._manager.restore(
+            step, args=ocp.args.Composite(state=ocp.args.StandardRestore(abstract))
+        )
+        return jax.tree.unflatten(jax.tree.structure(like), got["state"])
+
+    def close(self) -> None:
+        """Waits for what is being written."""
+        self._manager.close()
+
+
+def _plain(state: TrainState) -> list[Any]:
+    """The leaves in order: their structure comes from the config, not from the disk."""
+    return jax.tree.leaves(state)
+
+
+def config_json(config: Any) -> str:
+    """A frozen config as JSON."""
+    return json.dumps(dataclasses.asdict(config), indent=1, sort_keys=True)

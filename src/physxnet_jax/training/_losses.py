@@ -1,0 +1,70 @@
+"""The paper's losses: adversarial cross entropy with noisy labels, and L1 on texels."""
+
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Key
+
+
+def soft_labels(
+    key: Key[Array, ""], shape: tuple[int, ...], *, real: bool, flip: float = 0.05
+) -> Float[Array, "..."]:
+    """Noisy labels: generated in U(0, 0.3), real in U(0.7, 1), a few swapped.
+
+    Args:
+        key: Randomness.
+        shape: One label for each patch.
+        real: Which kind.
+        flip: Share of labels that take the other kind's value.
+
+    References:
+        PhysXNet, section 5.1.
+    """
+    k_value, k_flip = jax.random.split(key)
+    low = jax.random.uniform(k_value, shape, jnp.float32, 0.0, 0.3)
+    swapped = jax.random.bernoulli(k_flip, flip, shape)
+    return jnp.where(swapped != real, 1.0 - low, low)
+
+
+def discriminator_loss(
+    real_logits: Float[Array, "*batch"],
+    fake_logits: Float[Array, "*batch"],
+    real_labels: Float[Array, "*batch"],
+    fake_labels: Float[Array, "*batch"],
+) -> Float[Array, ""]:
+    """Sigmoid cross entropy of both classes (PhysXNet, equation 1)."""
+    real = optax.sigmoid_binary_cross_entropy(real_logits, real_labels)
+    fake = optax.sigmoid_binary_cross_entropy(fake_logits, fake_labels)
+    return jnp.mean(real) + jnp.mean(fake)
+
+
+def adversarial_loss(fake_logits: Float[Array, "*batch"]) -> Float[Array, ""]:
+    """The generator's share: its maps should pass for real (PhysXNet, equation 2).
+
+    Note (differs from the paper):
+        Equation 2 prints 1 - log D; the constant has no gradient and is left out.
+    """
+    ones = jnp.ones_like(fake_logits)
+    return jnp.mean(optax.sigmoid_binary_cross_entropy(fake_logits, ones))
+
+
+def masked_l1(
+    predicted: Float[Array, "batch texels 3"],
+    target: Float[Array, "batch texels 3"],
+    valid: Bool[Array, " texels"],
+    sample_weight: Float[Array, " batch"],
+) -> Float[Array, ""]:
+    """Mean absolute error over covered texels of the samples that count.
+
+    Args:
+        predicted: Normalised offsets.
+        target: Normalised offsets.
+        valid: Texels the template covers.
+        sample_weight: 1 for samples that count, 0 for those without this garment.
+
+    Returns:
+        The mean; zero if nothing counts.
+    """
+    weight = valid.astype(jnp.float32)[None] * sample_weight[:, None]
+    error = jnp.sum(jnp.abs(predicted - target), axis=2) / 3.0
+    return jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1.0)
