@@ -1,6 +1,10 @@
 """Garments: templates, fitting and materials. Knows nothing of simulation."""
 
-from ._fit import clearance as clearance, set_clearance as set_clearance
+from ._fit import (
+    clearance as clearance,
+    set_clearance as set_clearance,
+    smoothing_matrix as smoothing_matrix,
+)
 from ._garment import (
     COTTON as COTTON,
     TEMPLATES as TEMPLATES,

@@ -4,7 +4,7 @@ from ._blocks import depth_to_space as depth_to_space, upsampling_kernel as upsa
 from ._features import (
     WINDOW as WINDOW,
     Family as Family,
-    motion_features as motion_features,
+    clip_features as clip_features,
     num_channels as num_channels,
     skin_points as skin_points,
 )
@@ -16,11 +16,12 @@ from ._predictor import (
     Surface as Surface,
     Wearable as Wearable,
     apply_offsets as apply_offsets,
-    dress_windows as dress_windows,
+    dress_frames as dress_frames,
     make_generator as make_generator,
     make_surface as make_surface,
     make_wearable as make_wearable,
-    network_input as network_input,
+    normalise as normalise,
+    pad_clip as pad_clip,
     pose_windows as pose_windows,
     skin_wearable as skin_wearable,
 )

@@ -34,15 +34,15 @@ def skin_points(
     return jnp.einsum("pab,pb->pa", blend, rest, precision=_EXACT) + shift, blend
 
 
-def motion_features(
+def clip_features(
     rest: Float[Array, "texels 3"],
     weights: Float[Array, "texels joints"],
-    rotations: Float[Array, "window joints 3 3"],
-    translations: Float[Array, "window joints 3"],
+    rotations: Float[Array, "padded joints 3 3"],
+    translations: Float[Array, "padded joints 3"],
     fps: float | Float[Array, ""],
     family: Family,
-) -> Float[Array, "texels channels"]:
-    """Features of the last frame of a window of poses.
+) -> Float[Array, "frames texels channels"]:
+    """Features of successive frames, each point skinned once.
 
     Channels: velocities [m/s] of frames k-2, k-1, k, accelerations [m/s^2] of the
     same, and for ``local`` the direction of gravity. ``paper`` gives them in the
@@ -53,14 +53,14 @@ def motion_features(
     Args:
         rest: Texel points at rest [m].
         weights: Their skinning weights.
-        rotations: World rotations of joints, oldest first; repeat the first frame at a
-            clip's start.
-        translations: World translations of joints [m].
+        rotations: World rotations of joints of all frames, with four frames before the
+            first one wanted; repeat the first frame there at a clip's start.
+        translations: World translations of joints [m], likewise.
         fps: Frames a second.
         family: Which features.
 
     Returns:
-        Features of every covered texel.
+        Features of every covered texel; four frames fewer than poses.
 
     References:
         PhysXNet, section 3.1: X = (I_v, I_a) of frames k-2 to k.
@@ -68,12 +68,16 @@ def motion_features(
     points, blends = jax.vmap(skin_points, in_axes=(None, None, 0, 0))(
         rest, weights, rotations, translations
     )
-    velocity = velocity_maps(points, fps)[2:]
-    acceleration = acceleration_maps(points, fps)[2:]
-    both = jnp.concatenate([velocity, acceleration])
+    velocity = velocity_maps(points, fps)
+    acceleration = acceleration_maps(points, fps)
+    frames = rotations.shape[0] - (WINDOW - 1)
+    both = jnp.stack(
+        [x[2 + k : 2 + k + frames] for x in (velocity, acceleration) for k in range(3)],
+        axis=2,
+    )
     if family == "paper":
-        return jnp.moveaxis(both, 0, 1).reshape(rest.shape[0], 18)
-    frame = polar_rotation(blends[-1])
-    turned = jnp.einsum("pba,kpb->pka", frame, both, precision=_EXACT)
-    gravity = -frame[:, 1, :]
-    return jnp.concatenate([turned.reshape(rest.shape[0], 18), gravity], axis=1)
+        return both.reshape(frames, rest.shape[0], 18)
+    frame = polar_rotation(blends[WINDOW - 1 :])
+    turned = jnp.einsum("fpba,fpkb->fpka", frame, both, precision=_EXACT)
+    gravity = -frame[:, :, 1, :]
+    return jnp.concatenate([turned.reshape(frames, rest.shape[0], 18), gravity], axis=2)

@@ -13,7 +13,7 @@ from ..body import Body
 from ..garment import Garment
 from ..geometry import polar_rotation
 from ..uv import Atlas, Binding, dress_body
-from ._features import WINDOW, Family, motion_features, num_channels, skin_points
+from ._features import WINDOW, Family, clip_features, num_channels, skin_points
 from ._networks import Generator
 
 _EXACT = jax.lax.Precision.HIGHEST
@@ -115,35 +115,38 @@ class Predictor:
 
     def __call__(
         self,
-        rotations: Float[Array, "batch window joints 3 3"],
-        translations: Float[Array, "batch window joints 3"],
+        rotations: Float[Array, "padded joints 3 3"],
+        translations: Float[Array, "padded joints 3"],
         fps: float,
         templates: Sequence[str],
-    ) -> dict[str, Float[Array, "batch texels 3"]]:
-        """Offsets of the last frame of each window of poses [m].
+    ) -> dict[str, Float[Array, "frames texels 3"]]:
+        """Offsets [m] of successive frames.
 
         ``local``: the change of the offset at rest, in each cloth point's own frame.
         ``paper``: the offset from skin to cloth, in the world's frame. Only the
         decoders of ``templates`` are computed.
 
         Args:
-            rotations: World rotations of joints, oldest frame first.
-            translations: World translations of joints [m].
+            rotations: World rotations of joints, with four frames before the first one
+                wanted (see `pad_clip`).
+            translations: World translations of joints [m], likewise.
             fps: Frames a second.
             templates: Which maps.
 
         Returns:
             Offsets of covered texels; zero where the template doesn't reach.
         """
-        features = network_input(
-            self.surface, self.normalisation, rotations, translations, fps, self.config.family
+        features = clip_features(
+            self.surface.rest, self.surface.weights, rotations, translations, fps,
+            self.config.family,
         )
+        features = normalise(features, self.normalisation, self.config.family)
         return self.from_features(features, templates)
 
     def from_features(
         self, features: Float[Array, "batch texels channels"], templates: Sequence[str]
     ) -> dict[str, Float[Array, "batch texels 3"]]:
-        """Offsets [m] from normalised features, see `network_input`."""
+        """Offsets [m] from normalised features, see `normalise`."""
         network = nnx.merge(self.graph, self.state)
         network.eval()
         maps = self.atlas.to_map(features).astype(jnp.dtype(self.config.dtype))
@@ -158,23 +161,18 @@ class Predictor:
         }
 
 
-def network_input(
-    surface: Surface,
+def normalise(
+    features: Float[Array, "*batch texels channels"],
     normalisation: Normalisation,
-    rotations: Float[Array, "batch window joints 3 3"],
-    translations: Float[Array, "batch window joints 3"],
-    fps: float,
     family: Family,
-) -> Float[Array, "batch texels channels"]:
-    """Normalised features of windows of poses (PhysXNet, section 4.3)."""
-    features = jax.vmap(motion_features, in_axes=(None, None, 0, 0, None, None))(
-        surface.rest, surface.weights, rotations, translations, fps, family
-    )
+) -> Float[Array, "*batch texels channels"]:
+    """Features scaled to about [-1, 1], each kind by itself (PhysXNet, section 5.1)."""
     ones = jnp.ones((9,), jnp.float32)
     scale = [ones / normalisation.velocity, ones / normalisation.acceleration]
     if family == "local":
         scale.append(jnp.ones((3,), jnp.float32))
-    return features * jnp.concatenate(scale)[None, None]
+    row = jnp.concatenate(scale)
+    return features * row.reshape((1,) * (features.ndim - 1) + (-1,))
 
 
 def make_generator(config: ModelConfig, *, seed: int = 0) -> Generator:
@@ -269,20 +267,21 @@ def apply_offsets(
     return points + turned
 
 
-def dress_windows(
+def dress_frames(
     predictor: Predictor,
     wearables: Sequence[Wearable],
-    rotations: Float[Array, "batch window joints 3 3"],
-    translations: Float[Array, "batch window joints 3"],
+    rotations: Float[Array, "padded joints 3 3"],
+    translations: Float[Array, "padded joints 3"],
     fps: float,
-) -> tuple[Float[Array, "batch vertices 3"], ...]:
-    """Dressed garments [m] in the last frame of each window; pure, differentiable.
+) -> tuple[Float[Array, "frames vertices 3"], ...]:
+    """Dressed garments [m] of successive frames; pure, jit-able, differentiable.
 
     Args:
         predictor: The network.
         wearables: What is worn.
-        rotations: World rotations of joints, oldest frame first.
-        translations: World translations of joints [m].
+        rotations: World rotations of joints, with four frames before the first one
+            wanted (see `pad_clip`).
+        translations: World translations of joints [m], likewise.
         fps: Frames a second.
 
     Returns:
@@ -291,12 +290,18 @@ def dress_windows(
     templates = tuple(dict.fromkeys(w.template for w in wearables))
     offsets = predictor(rotations, translations, fps, templates)
     family = predictor.config.family
+    last = slice(WINDOW - 1, None)
     return tuple(
         jax.vmap(lambda r, t, o, w=w: apply_offsets(w, r, t, o, family))(
-            rotations[:, -1], translations[:, -1], offsets[w.template]
+            rotations[last], translations[last], offsets[w.template]
         )
         for w in wearables
     )
+
+
+def pad_clip(values: Float[Array, "frames ..."]) -> Float[Array, "padded ..."]:
+    """A clip with its first frame repeated four times before itself."""
+    return jnp.concatenate([jnp.repeat(values[:1], WINDOW - 1, axis=0), values])
 
 
 def pose_windows(

@@ -22,3 +22,8 @@ from ._retarget import (
     stand_on_floor as stand_on_floor,
 )
 from ._source import SourceClip as SourceClip
+from ._transforms import (
+    BLOCK as BLOCK,
+    clip_transforms as clip_transforms,
+    padded_block as padded_block,
+)

@@ -4,7 +4,6 @@ from ._batches import (
     Frames as Frames,
     batch_indices as batch_indices,
     load_frames as load_frames,
-    motion_transforms as motion_transforms,
     usable_garment as usable_garment,
 )
 from ._checkpoint import Checkpoints as Checkpoints

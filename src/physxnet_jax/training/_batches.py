@@ -13,11 +13,12 @@ from ..data import Sequence
 from ..errors import FormatError
 from ..garment import Garment
 from ..geometry import polar_rotation
+from ..motion import clip_transforms
 from ..models import (
     Family,
     Normalisation,
     Surface,
-    motion_features,
+    clip_features,
     pose_windows,
     skin_points,
 )
@@ -53,26 +54,6 @@ class Frames:
         return len(self.rotations)
 
 
-def motion_transforms(
-    body: Body, rest: Float[Array, "all 3"], sequence_rotations: Array, root: Array
-) -> tuple[Float[np.ndarray, "frames joints 3 3"], Float[np.ndarray, "frames joints 3"]]:
-    """World transforms of joints of every frame, on the host."""
-    frames = root.shape[0]
-    pick = np.minimum(np.arange(-(-frames // 32) * 32), frames - 1)
-    q, p = np.asarray(sequence_rotations)[pick], np.asarray(root)[pick]
-    out = [
-        _transforms(body, rest, q[i : i + 32], p[i : i + 32])
-        for i in range(0, len(pick), 32)
-    ]
-    world, shift = (np.concatenate([np.asarray(o[k]) for o in out]) for k in range(2))
-    return world[:frames], shift[:frames]
-
-
-@jax.jit
-def _transforms(body: Body, rest: Array, q: Array, p: Array) -> tuple[Array, Array]:
-    return jax.vmap(lambda a, b: body.transforms(rest, a, b))(q, p)
-
-
 def usable_garment(meta: dict) -> bool:
     """Whether a simulated garment stayed on the body."""
     return bool(meta["finite"]) and meta["worst"]["penetration_max"] <= MAX_PENETRATION
@@ -103,7 +84,7 @@ def load_frames(
     targets: dict[str, list] = {t: [] for t in garments}
     usable: dict[str, list] = {t: [] for t in garments}
     for s in sequences:
-        world, shift = motion_transforms(body, rest, s.motion.rotations, s.motion.root)
+        world, shift = clip_transforms(body, rest, s.motion)
         rotations.append(np.asarray(pose_windows(world)))
         translations.append(np.asarray(pose_windows(shift)))
         for name, g in garments.items():
@@ -215,13 +196,13 @@ def measure_normalisation(
         otherwise squeeze every other motion into a few per cent of the range.
     """
     pick = np.random.default_rng(seed).choice(len(frames), min(samples, len(frames)), False)
-    look = jax.jit(motion_features, static_argnames="family")
+    look = jax.jit(clip_features, static_argnames="family")
     rows = [
         np.abs(
             look(
                 surface.rest, surface.weights, frames.rotations[i],
                 frames.translations[i], frames.fps, family="paper",
-            )
+            )[0]
         )
         for i in pick
     ]

@@ -14,8 +14,9 @@ from ..models import (
     Discriminator,
     Normalisation,
     Surface,
+    clip_features,
     make_generator,
-    network_input,
+    normalise,
     num_channels,
 )
 from ..uv import Atlas, Transference
@@ -120,10 +121,11 @@ def make_step(
 
     @jax.jit
     def step(state: TrainState, batch: dict[str, Array], key: Key[Array, ""]) -> tuple[TrainState, dict]:
-        features = network_input(
-            surface, normalisation, batch["rotations"], batch["translations"], fps, family
+        features = jax.vmap(clip_features, in_axes=(None, None, 0, 0, None, None))(
+            surface.rest, surface.weights, batch["rotations"], batch["translations"], fps,
+            family,
         )
-        x = atlas.to_map(features)
+        x = atlas.to_map(normalise(features[:, 0], normalisation, family))
         targets, masks = {}, {}
         for t in templates:
             c = tables[t]

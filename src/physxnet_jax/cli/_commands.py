@@ -1,0 +1,79 @@
+"""The commands' options, as dataclasses that tyro reads."""
+
+import dataclasses
+import pathlib
+from typing import Annotated, Literal
+
+import tyro
+
+
+@dataclasses.dataclass(frozen=True)
+class Dress:
+    """Dress a moving person.
+
+    Examples:
+      physxnet dress walk --wear top bottom -o walk.usdc
+      physxnet dress 02_04.amc --wear dress --preview dress.mp4
+      physxnet dress dance.bvh --wear my_shirt.obj bottom --method simulate -o out.pc2
+    """
+
+    motion: tyro.conf.Positional[str]
+    """A .amc, .bvh or .npz file, or a built-in clip (see `physxnet clips`)."""
+    wear: tuple[str, ...] = ("top", "bottom")
+    """Templates (top, bottom, dress) and OBJ files."""
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Result: .usdc, .usd, .usda, .pc2 (with OBJ) or .npz."""
+    preview: pathlib.Path | None = None
+    """Picture or video: .png, .gif or .mp4."""
+    method: Literal["network", "lbs", "simulate"] = "network"
+    """network (packaged weights), lbs (skinning alone) or simulate (the teacher)."""
+    fps: float = 30.0
+    """Frames a second of the result."""
+    frames: int | None = None
+    """Stop after this many frames."""
+    source_fps: float | None = None
+    """True rate of the motion file, where its header is wrong or silent."""
+    skeleton: pathlib.Path | None = None
+    """The ASF of an AMC file, if it doesn't lie beside it."""
+    weights: str = "first"
+    """Name or folder of network weights."""
+    shape: tuple[str, ...] = ()
+    """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
+    body: bool = True
+    """Put the body into the result."""
+    push_out: bool = True
+    """Push vertices that end inside the body onto it."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Demo:
+    """Dress a built-in walk: writes demo.usdc, demo.mp4 and demo.png."""
+
+    out: pathlib.Path = pathlib.Path("out")
+    """Folder to write to."""
+    frames: int | None = None
+    """Stop after this many frames."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Doctor:
+    """Print versions, devices and optional parts; refuse a jaxlib that miscomputes."""
+
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Clips:
+    """List the built-in clips, templates and weights."""
+
+    debug: bool = False
+    """Show the trace of an error."""

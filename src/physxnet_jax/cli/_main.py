@@ -1,0 +1,137 @@
+"""Entry point: one sentence and a fix for every error, exit code 2."""
+
+import pathlib
+import sys
+from collections.abc import Sequence
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from ..errors import BrokenInstallError, PhysXNetError
+from ._commands import Clips, Demo, Doctor, Dress
+from ._doctor import doctor
+
+_Command = (
+    Annotated[Dress, tyro.conf.subcommand("dress")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+    | Annotated[Clips, tyro.conf.subcommand("clips")]
+)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs the command line.
+
+    Args:
+        arguments: Words after the program's name; the process's own by default.
+
+    Returns:
+        0 for success, 1 for a broken installation, 2 for an error of the user's.
+    """
+    command = tyro.cli(
+        _Command,  # pyright: ignore[reportArgumentType]
+        prog="physxnet",
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes,),
+    )
+    console = Console(stderr=False)
+    try:
+        return _run(command, console)
+    except PhysXNetError as error:
+        if command.debug:
+            raise
+        Console(stderr=True, soft_wrap=True).print(f"physxnet: {error}", style="red", markup=False)
+        return 1 if isinstance(error, BrokenInstallError) else 2
+    except KeyboardInterrupt:
+        Console(stderr=True).print("physxnet: stopped; nothing half-written is left.")
+        return 130
+
+
+def _run(command: Dress | Demo | Doctor | Clips, console: Console) -> int:
+    if isinstance(command, Doctor):
+        return doctor(console)
+    if isinstance(command, Clips):
+        from ..garment import TEMPLATES
+        from ..io import list_weights
+        from ..motion import CLIPS
+
+        console.print("clips:    ", ", ".join(CLIPS))
+        console.print("templates:", ", ".join(TEMPLATES))
+        console.print("weights:  ", ", ".join(list_weights()))
+        return 0
+    if isinstance(command, Demo):
+        out = command.out
+        common = {"frames": command.frames, "quiet": command.quiet}
+        jobs = Dress(
+            "walk", out=out / "demo.usdc", preview=out / "demo.mp4", **common
+        )
+        return _dress(jobs, console, still=out / "demo.png")
+    return _dress(command, console)
+
+
+def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) -> int:
+    from ..body import load_body
+    from ..dressing import dress
+    from ..io import check_output, write_clip
+    from ..motion import load_motion
+    from ..viewer import check_preview, render_preview
+    from ._table import closing_table
+
+    # Say what can't be written before minutes are spent.
+    if command.out is not None:
+        check_output(command.out)
+    if command.preview is not None:
+        check_preview(command.preview)
+    shape = load_body().shape(**_parse_shape(command.shape)) if command.shape else None
+    if command.quiet:
+        console = Console(quiet=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        tasks: dict[str, int] = {}
+
+        def progress(name: str, done: int, total: int) -> None:
+            if name not in tasks:
+                tasks[name] = bar.add_task(name, total=total)
+            bar.update(tasks[name], completed=done)  # pyright: ignore[reportArgumentType]
+
+        motion = load_motion(
+            command.motion, fps=command.fps, source_fps=command.source_fps,
+            skeleton=command.skeleton,
+        )
+        clip = dress(
+            motion, command.wear, method=command.method, frames=command.frames,
+            weights=command.weights, shape=shape, include_body=command.body,
+            resolve=command.push_out, progress=progress,
+        )
+        written: list[pathlib.Path] = []
+        if command.out is not None:
+            written += write_clip(command.out, clip.meshes, clip.fps)
+        pictures = [p for p in (command.preview, still) if p is not None]
+        for picture in pictures:
+            written.append(render_preview(picture, clip.meshes, clip.fps, progress=progress))
+    for table in closing_table(clip):
+        console.print(table)
+    for note in clip.notes:
+        console.print(note)
+    for path in written:
+        console.print(f"wrote {path} (import at {clip.fps:g} fps)", highlight=False)
+    return 0
+
+
+def _parse_shape(words: Sequence[str]) -> dict[str, float]:
+    out = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        try:
+            out[name] = float(value)
+        except ValueError:
+            raise PhysXNetError(
+                f"--shape {word}: expected name=number, for example weight_up=0.5."
+            ) from None
+    return out
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,32 @@
+"""The closing table of a dressed clip."""
+
+from rich.table import Table
+
+from ..dressing import DressedClip
+
+
+def closing_table(clip: DressedClip) -> list[Table]:
+    """What was made, what it cost and how well it sits."""
+    times = Table(
+        title=f"{clip.num_frames} frames at {clip.fps:g} fps, method {clip.method}",
+        title_justify="left",
+    )
+    times.add_column("stage")
+    times.add_column("first time [ms]", justify="right")
+    times.add_column("warm [ms a frame]", justify="right")
+    for stage in clip.stages:
+        warm = "" if stage.warm_ms is None else f"{stage.warm_ms:.2f}"
+        times.add_row(stage.name, f"{stage.cold_ms:.0f}", warm)
+    fit = Table(title="garments", title_justify="left")
+    for name in ("garment", "vertices", "ray hit rate", "fallbacks", "inside body (raw)", "inside body"):
+        fit.add_column(name, justify="left" if name == "garment" else "right")
+    for m in clip.garments:
+        fit.add_row(
+            m.name,
+            str(m.positions.shape[1]),
+            f"{100 * clip.hit_rate[m.name]:.1f} %",
+            str(clip.fallbacks[m.name]),
+            f"{100 * clip.inside_raw[m.name]:.2f} %",
+            f"{100 * clip.inside[m.name]:.2f} %",
+        )
+    return [times, fit]

@@ -1,0 +1,18 @@
+"""Dressing: the whole way from motion and garments to animated meshes."""
+
+from ._dress import (
+    METHODS as METHODS,
+    DressedClip as DressedClip,
+    Method as Method,
+    Stage as Stage,
+    dress as dress,
+    dress_block as dress_block,
+    fit_surface as fit_surface,
+    unbound_wearable as unbound_wearable,
+)
+from ._push_out import (
+    SkinPatch as SkinPatch,
+    make_patch as make_patch,
+    push_out as push_out,
+    skin_height as skin_height,
+)

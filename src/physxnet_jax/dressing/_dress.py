@@ -1,0 +1,375 @@
+"""From motion and garments to dressed, animated meshes."""
+
+import dataclasses
+import functools
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..body import Body, load_body
+from ..errors import PhysXNetError
+from ..garment import Garment
+from ..io import DEFAULT, AnimatedMesh, load_garment, load_predictor
+from ..models import (
+    WINDOW,
+    Predictor,
+    Wearable,
+    dress_frames,
+    make_surface,
+    make_wearable,
+    skin_wearable,
+)
+from ..motion import (
+    BLOCK,
+    Motion,
+    body_animation,
+    clip_transforms,
+    load_motion,
+    padded_block,
+)
+from ..simulation import Scene, XPBD, prepare_scene, simulate_batch
+from ..uv import Binding, Transference, bind
+from ._push_out import SkinPatch, make_patch, push_out, skin_height
+
+Method = Literal["network", "lbs", "simulate"]
+METHODS: tuple[Method, ...] = ("network", "lbs", "simulate")
+_COLOURS = ((0.16, 0.27, 0.55), (0.55, 0.28, 0.20), (0.25, 0.45, 0.30), (0.45, 0.25, 0.45))
+_SKIN_COLOUR = (0.69, 0.46, 0.33)
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """Time of one stage.
+
+    Attributes:
+        name: What was done.
+        cold_ms: First time, compilation included [ms]; in all if not by frame.
+        warm_ms: Median of the later times [ms a frame]; None if it ran once.
+    """
+
+    name: str
+    cold_ms: float
+    warm_ms: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class DressedClip:
+    """A dressed person in motion.
+
+    Attributes:
+        meshes: The body (unless left out) and the garments in the order worn.
+        fps: Frames a second.
+        stages: Where the time went.
+        hit_rate: For each garment, share of vertices whose ray met the body.
+        fallbacks: For each garment, vertices bound by the closest point.
+        inside_raw: For each garment, share of vertices inside the body as computed.
+        inside: The same in the result, after the push-out.
+        method: How the cloth was made.
+        notes: What the reader should know about it.
+    """
+
+    meshes: tuple[AnimatedMesh, ...]
+    fps: float
+    stages: tuple[Stage, ...]
+    hit_rate: dict[str, float]
+    fallbacks: dict[str, int]
+    inside_raw: dict[str, float]
+    inside: dict[str, float]
+    method: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def garments(self) -> tuple[AnimatedMesh, ...]:
+        """The garments alone."""
+        return tuple(m for m in self.meshes if m.name != "body")
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames."""
+        return len(self.meshes[0].positions)
+
+
+def dress(
+    motion: Motion | str | pathlib.Path,
+    wear: Sequence[Garment | str | pathlib.Path] = ("top", "bottom"),
+    *,
+    method: Method = "network",
+    fps: float = 30.0,
+    frames: int | None = None,
+    weights: str | pathlib.Path = DEFAULT,
+    body: Body | None = None,
+    shape: Float[Array, " shapes"] | None = None,
+    include_body: bool = True,
+    resolve: bool = True,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> DressedClip:
+    """Dresses a moving person.
+
+    Args:
+        motion: A motion, a motion file, or the name of a built-in clip.
+        wear: Garments, OBJ files or template names.
+        method: ``network`` (packaged weights), ``lbs`` (skinning alone, the baseline)
+            or ``simulate`` (the cloth simulator, the network's teacher).
+        fps: Frames a second of the result.
+        frames: Keep only this many frames.
+        weights: Name or folder of network weights.
+        body: The body; the built-in one by default.
+        shape: Shape parameters; the default shape if omitted.
+        include_body: Put the body's mesh into the result.
+        resolve: Push vertices that end inside the body onto it (network and lbs).
+        progress: Called with a stage, frames done and frames in all.
+
+    Returns:
+        Animated meshes with the time of every stage.
+
+    Raises:
+        PhysXNetError: Anything that can't be read, bound or worn; the text says why.
+
+    Example:
+        >>> clip = dress("walk", ["bottom"], method="lbs", frames=2)
+        >>> [m.name for m in clip.meshes]
+        ['body', 'bottom']
+    """
+    if method not in METHODS:
+        raise PhysXNetError(f"No method '{method}'; there are {', '.join(METHODS)}.")
+    stages: list[Stage] = []
+    watch = _Watch(stages)
+    body = load_body() if body is None else body
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    with watch("motion"):
+        clip = motion if isinstance(motion, Motion) else load_motion(motion, fps=fps)
+        if frames is not None:
+            clip = Motion(clip.rotations[:frames], clip.root[:frames], clip.fps, clip.name)
+        world, shift = clip_transforms(body, rest, clip)
+    with watch("garments"):
+        garments = _named([g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear])
+    hits = {g.name: 1.0 for g in garments}
+    fallbacks = {g.name: 0 for g in garments}
+    predictor = None
+    if method == "network":
+        with watch("weights"):
+            predictor = load_predictor(weights)
+            predictor = fit_surface(predictor, body, rest, shape)
+        with watch("binding"):
+            wearables = [_bound(predictor, body, rest, g) for g in garments]
+        for w in wearables:
+            hits[w.name] = w.binding.hit_rate
+            fallbacks[w.name] = w.binding.fallbacks
+    else:
+        wearables = [unbound_wearable(body, rest, g) for g in garments]
+    patches = [make_patch(body, rest, w) for w in wearables]
+    if method == "simulate":
+        positions = _simulate(garments, clip, body, shape, stages, progress)
+    else:
+        positions = _predict(predictor, wearables, patches, world, shift, clip.fps, resolve, stages, progress)
+    inside_raw = positions.pop("inside_raw", None)
+    inside = {
+        w.name: _inside_share(p, positions[w.name], world, shift)
+        for w, p in zip(wearables, patches, strict=True)
+    }
+    meshes = []
+    if include_body:
+        with watch("body"):
+            skin = np.asarray(body_animation(body, clip, shape))
+        mesh = body.rest_mesh()
+        meshes.append(
+            AnimatedMesh(
+                "body", skin, np.asarray(mesh.faces), np.asarray(mesh.uv),
+                np.asarray(mesh.uv_faces), _SKIN_COLOUR,
+            )
+        )
+    for k, g in enumerate(garments):
+        uv = None if g.mesh.uv is None else np.asarray(g.mesh.uv)
+        uv_faces = None if g.mesh.uv_faces is None else np.asarray(g.mesh.uv_faces)
+        meshes.append(
+            AnimatedMesh(
+                g.name, positions[g.name], np.asarray(g.mesh.faces), uv, uv_faces,
+                _COLOURS[k % len(_COLOURS)],
+            )
+        )
+    return DressedClip(
+        tuple(meshes), clip.fps, tuple(stages), hits, fallbacks,
+        inside if inside_raw is None else inside_raw, inside, method,
+    )
+
+
+class _Watch:
+    """Notes how long each stage takes."""
+
+    def __init__(self, stages: list[Stage]) -> None:
+        self._stages = stages
+        self._name = ""
+        self._start = 0.0
+
+    def __call__(self, name: str) -> "_Watch":
+        self._name = name
+        return self
+
+    def __enter__(self) -> None:
+        self._start = time.perf_counter()
+
+    def __exit__(self, *error: object) -> None:
+        self._stages.append(Stage(self._name, 1e3 * (time.perf_counter() - self._start)))
+
+
+def fit_surface(
+    predictor: Predictor, body: Body, rest: Float[Array, "all 3"], shape: Any | None
+) -> Predictor:
+    """The predictor with its texels on a body of another shape."""
+    if shape is None:
+        return predictor
+    surface = make_surface(predictor.atlas, body, rest, predictor.surface.valid)
+    return dataclasses.replace(predictor, surface=surface)
+
+
+def _bound(predictor: Predictor, body: Body, rest: Array, garment: Garment) -> Wearable:
+    if garment.template not in predictor.config.templates:
+        raise PhysXNetError(
+            f"{garment.name}: the weights have no decoder for '{garment.template}', only"
+            f" {', '.join(predictor.config.templates)}. Use other weights or --method lbs."
+        )
+    # Bound on the default shape, where garments are modelled; carried to others.
+    base = body.rest_vertices(body.default_shape())
+    tied = bind(predictor.atlas, body, base, garment, predictor.surface.valid[garment.template])
+    return make_wearable(body, rest, garment, tied)
+
+
+def unbound_wearable(body: Body, rest: Float[Array, "all 3"], garment: Garment) -> Wearable:
+    """A garment for skinning alone, tied to no atlas."""
+    n = garment.num_vertices
+    rows = Transference(
+        jnp.zeros((n, 3), jnp.int32), jnp.zeros((n, 3)), jnp.zeros((n,), bool)
+    )
+    none = Binding(rows, jnp.zeros((n, 4), jnp.int32), jnp.zeros((n, 4)), 1.0, 0, 0)
+    return Wearable(
+        garment.rest_vertices(rest), garment.skin, none, garment.rest_vertices(rest),
+        garment.skin, garment.template, garment.name,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("fps", "resolve"))
+def dress_block(
+    predictor: Predictor | None,
+    wearables: tuple[Wearable, ...],
+    patches: tuple[SkinPatch, ...],
+    rotations: Float[Array, "padded joints 3 3"],
+    translations: Float[Array, "padded joints 3"],
+    fps: float,
+    resolve: bool,
+) -> tuple[tuple[Array, Array], ...]:
+    """Garments of a block of frames and the share of vertices inside before push-out."""
+    last = slice(WINDOW - 1, None)
+    r, t = rotations[last], translations[last]
+    if predictor is None:
+        raw = tuple(jax.vmap(lambda a, b, w=w: skin_wearable(w, a, b))(r, t) for w in wearables)
+    else:
+        raw = dress_frames(predictor, wearables, rotations, translations, fps)
+    out = []
+    for x, patch in zip(raw, patches, strict=True):
+        height = jax.vmap(lambda p, a, b, q=patch: skin_height(q, p, a, b)[0])(x, r, t)
+        inside = jnp.mean((height < 0).astype(x.dtype), axis=1)
+        if resolve:
+            x = jax.vmap(lambda p, a, b, q=patch: push_out(q, p, a, b))(x, r, t)
+        out.append((x, inside))
+    return tuple(out)
+
+
+def _predict(
+    predictor: Predictor | None,
+    wearables: Sequence[Wearable],
+    patches: Sequence[SkinPatch],
+    world: np.ndarray,
+    shift: np.ndarray,
+    fps: float,
+    resolve: bool,
+    stages: list[Stage],
+    progress: Callable[[str, int, int], None] | None,
+) -> dict[str, Any]:
+    name = "network" if predictor is not None else "skinning"
+    frames = len(world)
+    blocks, times = [], []
+    for start in range(0, frames, BLOCK):
+        began = time.perf_counter()
+        out = dress_block(
+            predictor, tuple(wearables), tuple(patches),
+            jnp.asarray(padded_block(world, start, WINDOW - 1)),
+            jnp.asarray(padded_block(shift, start, WINDOW - 1)),
+            fps, resolve,
+        )
+        blocks.append(jax.tree.map(np.asarray, out))
+        times.append(1e3 * (time.perf_counter() - began))
+        if progress is not None:
+            progress(name, min(start + BLOCK, frames), frames)
+    warm = float(np.median(times[1:])) / BLOCK if len(times) > 1 else None
+    stages.append(Stage(name, times[0], warm))
+    result: dict[str, Any] = {"inside_raw": {}}
+    for k, w in enumerate(wearables):
+        result[w.name] = np.concatenate([b[k][0] for b in blocks])[:frames]
+        result["inside_raw"][w.name] = float(np.concatenate([b[k][1] for b in blocks])[:frames].mean())
+    return result
+
+
+def _simulate(
+    garments: Sequence[Garment],
+    clip: Motion,
+    body: Body,
+    shape: Any | None,
+    stages: list[Stage],
+    progress: Callable[[str, int, int], None] | None,
+) -> dict[str, np.ndarray]:
+    ticks = [time.perf_counter()]
+
+    def tick(done: int, total: int) -> None:
+        ticks.append(time.perf_counter())
+        if progress is not None:
+            progress("simulation", done, total)
+
+    scene = prepare_scene(Scene(tuple(garments), body=body, shape=shape))
+    rollout = simulate_batch(scene, [clip], solver=XPBD(), progress=tick)[0]
+    if not rollout.finite.all():
+        frame = int(np.argmin(rollout.finite))
+        raise PhysXNetError(
+            f"{clip.name}: the simulation isn't finite from frame {frame} on. Look for a"
+            " teleport in the motion or degenerate triangles in the garment."
+        )
+    laps = 1e3 * np.diff(ticks)
+    warm = float(np.median(laps[1:])) / 10 if len(laps) > 1 else None
+    stages.append(Stage("simulation", float(laps[0]), warm))
+    return dict(zip([g.name for g in garments], rollout.positions, strict=True))
+
+
+def _inside_share(
+    patch: SkinPatch, positions: np.ndarray, world: np.ndarray, shift: np.ndarray
+) -> float:
+    shares = []
+    for start in range(0, len(positions), BLOCK):
+        height = _heights(
+            patch, padded_block(positions, start, 0), padded_block(world, start, 0),
+            padded_block(shift, start, 0),
+        )
+        shares.append(np.asarray(height < 0)[: len(positions) - start].mean(axis=1))
+    return float(np.concatenate(shares).mean())
+
+
+@jax.jit
+def _heights(patch: SkinPatch, x: Array, r: Array, t: Array) -> Array:
+    return jax.vmap(lambda p, a, b: skin_height(patch, p, a, b)[0])(x, r, t)
+
+
+def _named(garments: list[Garment]) -> list[Garment]:
+    """Garments with names that differ."""
+    seen: dict[str, int] = {}
+    out = []
+    for g in garments:
+        seen[g.name] = seen.get(g.name, 0) + 1
+        name = g.name if seen[g.name] == 1 else f"{g.name}_{seen[g.name]}"
+        out.append(dataclasses.replace(g, name=name))
+    if not out:
+        raise PhysXNetError("Nothing to wear: name at least one garment.")
+    return out

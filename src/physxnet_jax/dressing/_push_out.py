@@ -1,0 +1,93 @@
+"""The last touch: vertices that a prediction left inside the body move onto it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..body import NUM_BODY_VERTICES, Body
+from ..geometry import TriMesh, closest_among, nearby_faces, safe_normalize, vertex_normals
+from ..models import Wearable, skin_points
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class SkinPatch:
+    """The skin near each garment vertex.
+
+    Attributes:
+        rest: Body vertices used, at rest [m], shape [skin, 3].
+        normals: Their unit normals at rest, shape [skin, 3].
+        weights: Their skinning weights, shape [skin, joints].
+        faces: Triangles over them, shape [faces, 3].
+        candidates: Triangles near each garment vertex, shape [vertices, k].
+    """
+
+    rest: Float[Array, "skin 3"]
+    normals: Float[Array, "skin 3"]
+    weights: Float[Array, "skin joints"]
+    faces: Int[Array, "faces 3"]
+    candidates: Int[Array, "vertices k"]
+
+
+def make_patch(body: Body, rest: Float[Array, "all 3"], wearable: Wearable) -> SkinPatch:
+    """Triangles round the skin point nearest to each vertex at rest."""
+    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
+    faces = np.asarray(mesh.faces)
+    near = nearby_faces(np.asarray(mesh.vertices), faces, np.asarray(wearable.rest), neighbours=8)
+    used_faces, local_faces = np.unique(near, return_inverse=True)
+    rows, corners = np.unique(faces[used_faces], return_inverse=True)
+    pick = jnp.asarray(rows)
+    return SkinPatch(
+        mesh.vertices[pick],
+        vertex_normals(mesh.vertices, mesh.faces)[pick],
+        body.weights[pick],
+        jnp.asarray(corners.reshape(-1, 3).astype(np.int32)),
+        jnp.asarray(local_faces.reshape(near.shape).astype(np.int32)),
+    )
+
+
+def skin_height(
+    patch: SkinPatch,
+    points: Float[Array, "vertices 3"],
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+) -> tuple[Float[Array, " vertices"], Float[Array, "vertices 3"]]:
+    """Height of points above the nearby skin [m] and the skin's smooth normal there."""
+    skin, blend = skin_points(patch.rest, patch.weights, rotations, translations)
+    normals = jnp.einsum("vab,vb->va", blend, patch.normals)
+    hit = closest_among(TriMesh(skin, patch.faces), points, patch.candidates)
+    tri = patch.faces[jax.lax.stop_gradient(hit.face)]
+    weights = hit.weights
+    foot = jnp.einsum("vk,vkc->vc", weights, skin[tri])
+    normal = safe_normalize(jnp.einsum("vk,vkc->vc", weights, normals[tri]))
+    return jnp.sum((points - foot) * normal, axis=1), normal
+
+
+def push_out(
+    patch: SkinPatch,
+    points: Float[Array, "vertices 3"],
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+    *,
+    gap: float = 0.002,
+    deepest: float = 0.04,
+) -> Float[Array, "vertices 3"]:
+    """Points lifted to a small gap above the skin where they are below it.
+
+    Continuous in its inputs. Points deeper than ``deepest`` are on another limb's far
+    side, not in the skin, and stay.
+
+    Args:
+        patch: The skin near each point.
+        points: Garment vertices [m].
+        rotations: World rotations of joints.
+        translations: World translations of joints [m].
+        gap: Least height above the skin [m].
+        deepest: Depth from which on nothing is done [m].
+    """
+    height, normal = skin_height(patch, points, rotations, translations)
+    lift = jnp.where(height > -deepest, jnp.maximum(gap - height, 0.0), 0.0)
+    return points + lift[:, None] * normal

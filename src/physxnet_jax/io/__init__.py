@@ -1,0 +1,15 @@
+"""Files in and out. Optional libraries are imported inside the functions."""
+
+from ._clip import AnimatedMesh as AnimatedMesh
+from ._garment import GarmentReport as GarmentReport, load_garment as load_garment
+from ._obj import ObjMesh as ObjMesh, read_obj as read_obj, write_obj as write_obj
+from ._pc2 import read_pc2 as read_pc2, write_pc2 as write_pc2
+from ._usd import write_usd as write_usd
+from ._weights import (
+    DEFAULT as DEFAULT,
+    list_weights as list_weights,
+    load_predictor as load_predictor,
+    read_card as read_card,
+    save_predictor as save_predictor,
+)
+from ._write import EXTENSIONS as EXTENSIONS, check_output as check_output, write_clip as write_clip

@@ -1,0 +1,49 @@
+"""What writers write: animated meshes of one clip."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@dataclasses.dataclass(frozen=True)
+class AnimatedMesh:
+    """A mesh of constant topology in motion.
+
+    Attributes:
+        name: Name of the mesh.
+        positions: Vertex positions [m], Y up, shape [frames, vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        uv: Texture coordinates, shape [uvs, 2]; or None.
+        uv_faces: Corners in ``uv``, shape [faces, 3]; or None.
+        colour: Display colour, linear RGB in [0, 1].
+    """
+
+    name: str
+    positions: Float[np.ndarray, "frames vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    uv: Float[np.ndarray, "uvs 2"] | None = None
+    uv_faces: Int[np.ndarray, "faces 3"] | None = None
+    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+
+
+def vertex_velocities(
+    positions: Float[np.ndarray, "frames vertices 3"], fps: float
+) -> Float[np.ndarray, "frames vertices 3"]:
+    """Velocities [m/s] by differences with the frame before; zero in the first."""
+    out = np.zeros_like(positions)
+    out[1:] = (positions[1:] - positions[:-1]) * fps
+    return out
+
+
+def smooth_normals(
+    positions: Float[np.ndarray, "frames vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "frames vertices 3"]:
+    """Area-weighted unit vertex normals of every frame."""
+    out = np.zeros(positions.shape, dtype=np.float32)
+    for k, x in enumerate(positions):
+        n = np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]])
+        for c in range(3):
+            np.add.at(out[k], faces[:, c], n)
+        out[k] /= np.maximum(np.linalg.norm(out[k], axis=1, keepdims=True), 1e-12)
+    return out

@@ -1,0 +1,191 @@
+"""Any garment mesh as a `Garment`: units, template and skin found and reported."""
+
+import dataclasses
+import pathlib
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial import cKDTree
+
+from ..body import Body, load_body
+from ..errors import MeshError
+from ..garment import (
+    COTTON,
+    TEMPLATES,
+    Garment,
+    Template,
+    carried_weights,
+    clearance,
+    set_clearance,
+    smoothing_matrix,
+    template,
+)
+from ..geometry import (
+    boundary_loops,
+    closest_among,
+    make_mesh,
+    manifold_report,
+    nearby_faces,
+)
+from ._obj import ObjMesh, read_obj
+
+_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
+_NEAREST = 0.003
+
+
+@dataclasses.dataclass(frozen=True)
+class GarmentReport:
+    """What was found out about a garment file.
+
+    Attributes:
+        unit: Its unit.
+        up: Its up axis.
+        vertices: Number of vertices.
+        faces: Number of triangles.
+        topology: Counts of boundary, non-manifold and duplicate elements.
+        inside: Share of vertices that lay within 3 mm of the skin or inside it, and
+            were moved out.
+        distance: Median distance to the skin [m].
+        template: The template it is dressed by.
+    """
+
+    unit: str
+    up: str
+    vertices: int
+    faces: int
+    topology: dict[str, int]
+    inside: float
+    distance: float
+    template: str
+
+
+def load_garment(
+    path: str | pathlib.Path,
+    *,
+    body: Body | None = None,
+    kind: Template | None = None,
+) -> tuple[Garment, GarmentReport]:
+    """A garment from an OBJ file modelled on the body, or a template by name.
+
+    The unit and up axis are those that put the mesh on the body. Vertices inside the
+    skin are moved 3 mm out. Each vertex is carried by the closest skin; far from it the
+    skinning weights are smoothed, so that a skirt isn't torn between the legs.
+
+    Args:
+        path: An ``.obj`` file, or ``top``, ``bottom`` or ``dress``.
+        body: The body; the built-in one by default.
+        kind: Template to dress it by; guessed from what it covers if omitted.
+
+    Returns:
+        The garment and what was found out.
+
+    Raises:
+        MeshError: A mesh that no unit and axis puts on the body.
+        FormatError: A file that can't be read.
+    """
+    body = load_body() if body is None else body
+    if str(path) in TEMPLATES:
+        g = template(str(path))  # pyright: ignore[reportArgumentType]
+        report = GarmentReport(
+            "m", "Y", g.num_vertices, g.mesh.faces.shape[0],
+            manifold_report(np.asarray(g.mesh.faces)), 0.0, 0.01, g.template,
+        )
+        return g, report
+    path = pathlib.Path(path)
+    if path.suffix.lower() != ".obj":
+        raise MeshError(
+            f"{path}: garments are OBJ files or one of {', '.join(TEMPLATES)}. Export the"
+            " mesh as OBJ (triangles or quads, with uv)."
+        )
+    raw = read_obj(path)
+    rest = body.rest_vertices(body.default_shape())
+    mesh = body.rest_mesh()
+    skin = np.asarray(mesh.vertices)
+    v, unit, up = _place(path, raw.vertices, skin)
+    distance, _ = clearance(mesh, v)
+    inside = distance < _NEAREST
+    moved = v
+    if inside.any():
+        target = np.full(len(v), _NEAREST)
+        moved = set_clearance(mesh, v, raw.faces, target, free=np.ones(len(v)), iterations=8)
+        moved = np.where((distance < 3 * _NEAREST)[:, None], moved, v)
+    near = nearby_faces(skin, np.asarray(mesh.faces), moved, neighbours=12)
+    points = jnp.asarray(moved.astype(np.float32))
+    hit = closest_among(mesh, points, jnp.asarray(near))
+    refs = mesh.faces[hit.face]
+    foot = jnp.einsum("vk,vkc->vc", hit.weights, rest[refs])
+    weights = np.asarray(carried_weights(body.weights, refs, hit.weights))
+    weights = _smooth_far(weights, raw, np.sqrt(np.asarray(hit.squared_distance)))
+    kind = _guess(moved, raw) if kind is None else kind
+    pinned = np.zeros(len(v), dtype=bool)
+    loops = boundary_loops(raw.faces)
+    if kind == "bottom" and loops:
+        pinned[max(loops, key=lambda x: moved[x, 1].mean())] = True
+    garment = Garment(
+        make_mesh(moved, raw.faces, raw.uv, raw.uv_faces, name=str(path)),
+        jnp.asarray(pinned),
+        refs,
+        hit.weights,
+        points - foot,
+        jnp.asarray(weights.astype(np.float32)),
+        COTTON,
+        kind,
+        path.stem,
+    )
+    report = GarmentReport(
+        unit, up, len(v), len(raw.faces), manifold_report(raw.faces),
+        float(inside.mean()), float(np.median(np.abs(distance))), kind,
+    )
+    return garment, report
+
+
+def _place(
+    path: pathlib.Path, vertices: np.ndarray, skin: np.ndarray
+) -> tuple[Float[np.ndarray, "vertices 3"], str, str]:
+    """The unit and axis that bring the mesh closest to the skin."""
+    tree = cKDTree(skin)
+    floor = np.array([0.0, float(skin[:, 1].min()), 0.0])
+    best = (np.inf, vertices, "m", "Y")
+    for up in ("Y", "Z"):
+        turned = vertices if up == "Y" else vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
+        for unit, scale in _UNITS.items():
+            for shift in (np.zeros(3), floor):
+                v = turned * scale + shift
+                size = np.ptp(v, axis=0).max()
+                if not 0.1 < size < 2.5:
+                    continue
+                score = float(np.mean(tree.query(v)[0]))
+                if score < best[0] - 1e-9:
+                    best = (score, v, unit, up)
+    score, v, unit, up = best
+    if score > 0.12:
+        size = np.ptp(vertices, axis=0)
+        raise MeshError(
+            f"{path}: no unit and up axis puts this mesh on the body: it measures"
+            f" {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} and stays"
+            f" {score:.2f} m away on average. Move it onto the body at rest (A-pose,"
+            " Y up, origin in the pelvis) and export again."
+        )
+    return v, unit, up
+
+
+def _guess(v: np.ndarray, raw: ObjMesh) -> Template:
+    """From what it covers: above the waist, below the crotch, one tube or two."""
+    upper = float(np.mean(v[:, 1] > 0.15))
+    lower = float(np.mean(v[:, 1] < -0.08))
+    if upper > 0.15 and lower > 0.15:
+        return "dress"
+    if upper >= lower:
+        return "top"
+    low = [x for x in boundary_loops(raw.faces) if v[x, 1].mean() < -0.08 and len(x) > 4]
+    return "bottom" if len(low) >= 2 else "dress"
+
+
+def _smooth_far(weights: np.ndarray, raw: ObjMesh, distance: np.ndarray) -> np.ndarray:
+    """Skinning weights averaged over the mesh where the skin is far away."""
+    average = smoothing_matrix(raw.faces, len(weights))
+    share = np.clip((distance - 0.02) / 0.04, 0.0, 1.0)[:, None]
+    for _ in range(60):
+        weights = weights + share * (average @ weights - weights)
+    return weights / weights.sum(axis=1, keepdims=True)

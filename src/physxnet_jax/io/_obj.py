@@ -1,0 +1,143 @@
+"""Wavefront OBJ: polygons, texture coordinates, several objects in a file."""
+
+import dataclasses
+import pathlib
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..errors import FormatError
+
+_MAX_BYTES = 500_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class ObjMesh:
+    """An OBJ as it is, triangulated.
+
+    Attributes:
+        vertices: Positions in the file's unit, in the file's order, shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        uv: Texture coordinates, shape [uvs, 2]; None if any face lacks them.
+        uv_faces: Corners in ``uv``, shape [faces, 3]; None likewise.
+        polygons: Number of faces before triangulation.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    uv: Float[np.ndarray, "uvs 2"] | None
+    uv_faces: Int[np.ndarray, "faces 3"] | None
+    polygons: int
+
+
+def read_obj(path: str | pathlib.Path) -> ObjMesh:
+    """Reads an OBJ; quads are split along their shorter diagonal, others in a fan.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The mesh; vertex order is kept.
+
+    Raises:
+        FormatError: Missing, empty, binary or malformed files; indices out of range;
+            values that aren't finite. File, line and fix are named.
+    """
+    path = pathlib.Path(path)
+    if not path.is_file():
+        raise FormatError(f"{path}: no such file. Check the path.")
+    if path.stat().st_size > _MAX_BYTES:
+        raise FormatError(f"{path}: over 500 MB. Decimate the mesh first.")
+    blob = path.read_bytes()
+    if b"\0" in blob[:4096]:
+        raise FormatError(f"{path}: binary data, not OBJ text. Export as OBJ.")
+    vertices: list[list[float]] = []
+    uv: list[list[float]] = []
+    polygons: list[list[tuple[int, int]]] = []
+    where: list[int] = []
+    for n, line in enumerate(blob.decode("utf-8", "replace").splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        if words[0] == "v":
+            vertices.append(_floats(path, n, words[1:4], 3))
+        elif words[0] == "vt":
+            uv.append(_floats(path, n, words[1:3], 2))
+        elif words[0] == "f":
+            polygons.append(
+                [_corner(path, n, w, len(vertices), len(uv)) for w in words[1:]]
+            )
+            where.append(n)
+            if len(polygons[-1]) < 3:
+                raise FormatError(f"{path}:{n}: a face of {len(words) - 1} corners. Delete it.")
+    if not vertices or not polygons:
+        raise FormatError(f"{path}: {len(vertices)} vertices and {len(polygons)} faces; a mesh needs both.")
+    v = np.asarray(vertices)
+    for n, polygon in zip(where, polygons, strict=True):
+        for a, t in polygon:
+            if not 0 <= a < len(v) or t >= len(uv):
+                raise FormatError(
+                    f"{path}:{n}: a face names vertex {a + 1} or uv {t + 1}, but there"
+                    f" are {len(v)} and {len(uv)}. Export the file again."
+                )
+    corners = [c for p in polygons for c in _split(p, v)]
+    table = np.asarray(corners)
+    has_uv = bool(uv) and bool((table[..., 1] >= 0).all())
+    return ObjMesh(
+        v,
+        table[..., 0],
+        np.asarray(uv) if has_uv else None,
+        table[..., 1] if has_uv else None,
+        len(polygons),
+    )
+
+
+def write_obj(
+    path: str | pathlib.Path,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    uv: Float[np.ndarray, "uvs 2"] | None = None,
+    uv_faces: Int[np.ndarray, "faces 3"] | None = None,
+) -> None:
+    """Writes one mesh, atomically; positions [m]."""
+    path = pathlib.Path(path)
+    lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in np.asarray(vertices)]
+    if uv is not None and uv_faces is not None:
+        lines += [f"vt {a:.6g} {b:.6g}" for a, b in np.asarray(uv)]
+        pairs = np.stack([faces, uv_faces], axis=2) + 1
+        lines += ["f " + " ".join(f"{a}/{b}" for a, b in f) for f in pairs]
+    else:
+        lines += ["f " + " ".join(str(a) for a in f) for f in np.asarray(faces) + 1]
+    part = path.with_name(path.name + ".part")
+    part.write_text("\n".join(lines) + "\n")
+    part.replace(path)
+
+
+def _floats(path: pathlib.Path, n: int, words: list[str], count: int) -> list[float]:
+    try:
+        out = [float(w) for w in words]
+    except ValueError:
+        raise FormatError(f"{path}:{n}: '{' '.join(words)[:60]}' aren't numbers. Export again.") from None
+    if len(out) != count or not np.isfinite(out).all():
+        raise FormatError(f"{path}:{n}: expected {count} finite numbers, got {out}. Export again.")
+    return out
+
+
+def _corner(path: pathlib.Path, n: int, word: str, vertices: int, uvs: int) -> tuple[int, int]:
+    parts = word.split("/")
+    try:
+        a = int(parts[0])
+        t = int(parts[1]) if len(parts) > 1 and parts[1] else 0
+    except ValueError:
+        raise FormatError(f"{path}:{n}: '{word[:40]}' isn't a face corner. Export again.") from None
+    a = a - 1 if a > 0 else vertices + a
+    t = t - 1 if t > 0 else (uvs + t if t < 0 else -1)
+    return a, t
+
+
+def _split(polygon: list[tuple[int, int]], v: np.ndarray) -> list[list[tuple[int, int]]]:
+    if len(polygon) == 4:
+        p = v[[c[0] for c in polygon]]
+        if np.sum((p[0] - p[2]) ** 2) > np.sum((p[1] - p[3]) ** 2):
+            polygon = polygon[1:] + polygon[:1]
+    return [[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]

@@ -1,0 +1,146 @@
+"""Trained predictors on disk: safetensors and a JSON card, tied to their atlas."""
+
+import dataclasses
+import hashlib
+import importlib.resources
+import json
+import pathlib
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from safetensors.numpy import load as load_tensors, save as save_tensors
+
+from ..body import load_body
+from ..errors import WeightsError
+from ..models import (
+    ModelConfig,
+    Normalisation,
+    Predictor,
+    make_generator,
+    make_surface,
+)
+from ..uv import make_atlas
+
+DEFAULT = "first"
+_TENSORS, _CARD = "weights.safetensors", "card.json"
+
+
+def save_predictor(
+    folder: str | pathlib.Path, predictor: Predictor, *, name: str, card: dict[str, Any] | None = None
+) -> None:
+    """Writes a predictor: half-precision weights, masks, and a card.
+
+    Args:
+        folder: Where ``weights.safetensors`` and ``card.json`` go.
+        predictor: What to write.
+        name: Its name.
+        card: Anything else to tell: data, licence, measured table.
+    """
+    folder = pathlib.Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    leaves = jax.tree.leaves(predictor.state)
+    tensors = {f"leaf_{k:03d}": np.asarray(x).astype(np.float16) for k, x in enumerate(leaves)}
+    for t, mask in predictor.surface.valid.items():
+        tensors[f"valid_{t}"] = np.packbits(np.asarray(mask))
+    blob = save_tensors(tensors)
+    n = predictor.normalisation
+    info = {
+        "name": name,
+        "model": dataclasses.asdict(predictor.config),
+        "normalisation": {
+            "velocity": float(n.velocity),
+            "acceleration": float(n.acceleration),
+            "offset": {t: float(v) for t, v in n.offset.items()},
+        },
+        "atlas": predictor.atlas.digest(),
+        "sha256": hashlib.sha256(blob).hexdigest(),
+        **(card or {}),
+    }
+    for file, data in ((_TENSORS, blob), (_CARD, json.dumps(info, indent=1).encode())):
+        part = folder / f"{file}.part"
+        part.write_bytes(data)
+        part.replace(folder / file)
+
+
+def list_weights() -> list[str]:
+    """Names of the weights in the package."""
+    root = importlib.resources.files(__package__) / "weights"
+    return sorted(p.name for p in root.iterdir() if (p / _CARD).is_file()) if root.is_dir() else []
+
+
+def read_card(weights: str | pathlib.Path = DEFAULT) -> dict[str, Any]:
+    """The card of weights by name or folder."""
+    return json.loads((_folder(weights) / _CARD).read_text())
+
+
+def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
+    """A predictor by the name of packaged weights, or from a folder.
+
+    Args:
+        weights: A name of `list_weights`, or a folder that `save_predictor` wrote.
+
+    Returns:
+        The predictor, on the built-in body's default shape.
+
+    Raises:
+        WeightsError: Unknown name, damaged file, or an atlas other than the one the
+            weights were trained on.
+    """
+    folder = _folder(weights)
+    card = json.loads((folder / _CARD).read_text())
+    blob = (folder / _TENSORS).read_bytes()
+    digest = hashlib.sha256(blob).hexdigest()
+    if digest != card["sha256"]:
+        raise WeightsError(
+            f"{weights}: sha256 is {digest[:12]}…, the card says {card['sha256'][:12]}…;"
+            " the file is damaged. Reinstall or copy it again."
+        )
+    tensors = load_tensors(blob)
+    model = ModelConfig(**{**card["model"], "templates": tuple(card["model"]["templates"])})
+    atlas = make_atlas(model.resolution)
+    if atlas.digest() != card["atlas"]:
+        raise WeightsError(
+            f"{weights}: trained on atlas {card['atlas']}, this version makes"
+            f" {atlas.digest()}. Use the package version that the weights came with."
+        )
+    network = make_generator(model)
+    network.eval()
+    graph, state = nnx.split(network)
+    like, structure = jax.tree.flatten(state)
+    leaves = [tensors[f"leaf_{k:03d}"] for k in range(len(like))]
+    for k, (x, y) in enumerate(zip(leaves, like, strict=True)):
+        if x.shape != y.shape:
+            raise WeightsError(f"{weights}: leaf {k} has shape {x.shape}, expected {y.shape}.")
+    state = jax.tree.unflatten(
+        structure, [jnp.asarray(x.astype(y.dtype)) for x, y in zip(leaves, like, strict=True)]
+    )
+    valid = {
+        t: jnp.asarray(np.unpackbits(tensors[f"valid_{t}"])[: atlas.num_texels].astype(bool))
+        for t in model.templates
+    }
+    n = card["normalisation"]
+    normalisation = Normalisation(
+        jnp.float32(n["velocity"]),
+        jnp.float32(n["acceleration"]),
+        {t: jnp.float32(v) for t, v in n["offset"].items()},
+    )
+    body = load_body()
+    surface = make_surface(atlas, body, body.rest_vertices(body.default_shape()), valid)
+    return Predictor(atlas, surface, normalisation, state, graph, model)
+
+
+def _folder(weights: str | pathlib.Path) -> pathlib.Path:
+    path = pathlib.Path(weights)
+    if (path / _CARD).is_file():
+        return path
+    root = importlib.resources.files(__package__) / "weights" / str(weights)
+    packaged = pathlib.Path(str(root))
+    if not (packaged / _CARD).is_file():
+        raise WeightsError(
+            f"No weights '{weights}': neither a folder with {_CARD} nor one of"
+            f" {', '.join(list_weights()) or 'none in this package'}."
+        )
+    return packaged

@@ -1,0 +1,66 @@
+"""One door for every output: the extension decides."""
+
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..errors import FormatError
+from ._clip import AnimatedMesh
+from ._obj import write_obj
+from ._pc2 import write_pc2
+from ._usd import write_usd
+
+EXTENSIONS = (".usdc", ".usd", ".usda", ".pc2", ".npz")
+
+
+def check_output(path: str | pathlib.Path) -> pathlib.Path:
+    """The path, if its extension is one that can be written.
+
+    Raises:
+        FormatError: Otherwise; the text lists the extensions.
+    """
+    path = pathlib.Path(path)
+    if path.suffix.lower() not in EXTENSIONS:
+        raise FormatError(
+            f"{path}: can't write '{path.suffix}'; choose one of {', '.join(EXTENSIONS)}."
+        )
+    return path
+
+
+def write_clip(
+    path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float
+) -> list[pathlib.Path]:
+    """Writes a clip; returns the files written.
+
+    ``.usdc``, ``.usd``, ``.usda``: one stage. ``.npz``: ``NAME_positions``,
+    ``NAME_faces`` and ``fps``. ``.pc2``: for each mesh a cache and an OBJ of its first
+    frame with the same vertex order, ``STEM_NAME.pc2`` and ``STEM_NAME.obj``.
+
+    Raises:
+        FormatError: Another extension.
+    """
+    path = check_output(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    suffix = path.suffix.lower()
+    if suffix.startswith(".usd"):
+        write_usd(path, meshes, fps)
+        return [path]
+    if suffix == ".npz":
+        arrays = {"fps": np.asarray(fps)}
+        for m in meshes:
+            arrays[f"{m.name}_positions"] = m.positions
+            arrays[f"{m.name}_faces"] = m.faces
+        part = path.with_name(path.name + ".part")
+        with part.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+        part.replace(path)
+        return [path]
+    written = []
+    for m in meshes:
+        cache = path.with_name(f"{path.stem}_{m.name}.pc2")
+        write_pc2(cache, m.positions)
+        shape = cache.with_suffix(".obj")
+        write_obj(shape, m.positions[0], m.faces, m.uv, m.uv_faces)
+        written += [cache, shape]
+    return written

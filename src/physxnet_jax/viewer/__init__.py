@@ -1,0 +1,8 @@
+"""Looking at results: pictures and videos."""
+
+from ._render import (
+    PREVIEWS as PREVIEWS,
+    check_preview as check_preview,
+    render_frame as render_frame,
+    render_preview as render_preview,
+)

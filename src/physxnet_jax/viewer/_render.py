@@ -1,0 +1,158 @@
+"""Still pictures and videos of dressed people, off screen."""
+
+import os
+import pathlib
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import FormatError, MissingDependencyError
+from ..io import AnimatedMesh
+
+PREVIEWS = (".mp4", ".gif", ".png")
+
+
+def _plotter(size: tuple[int, int]) -> Any:
+    try:
+        import pyvista
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Pictures need pyvista: pip install 'physxnet-jax[render]'."
+        ) from error
+    # Without a display VTK tries X first and complains; it then falls back to EGL.
+    if "DISPLAY" not in os.environ:
+        import vtk
+
+        vtk.vtkLogger.SetStderrVerbosity(vtk.vtkLogger.VERBOSITY_OFF)
+    plotter = pyvista.Plotter(off_screen=True, window_size=list(size), lighting="three lights")
+    plotter.set_background("white", top="#cfd8e3")  # pyright: ignore[reportArgumentType]
+    return plotter
+
+
+class _Stage:
+    """A scene whose meshes are moved from frame to frame."""
+
+    def __init__(self, meshes: Sequence[AnimatedMesh], size: tuple[int, int]) -> None:
+        import pyvista
+
+        self.plotter = _plotter(size)
+        self.meshes = meshes
+        self.surfaces = []
+        everything = np.concatenate([m.positions[0] for m in meshes])
+        self.floor = float(min(m.positions[..., 1].min() for m in meshes))
+        self.height = float(np.ptp(everything[:, 1]))
+        for m in meshes:
+            surface = pyvista.PolyData.from_regular_faces(m.positions[0].copy(), m.faces)
+            self.surfaces.append(surface)
+            self.plotter.add_mesh(
+                surface, color=m.colour, smooth_shading=True, specular=0.1,
+                backface_params={"color": tuple(0.6 * c for c in m.colour)},
+            )
+        path = np.concatenate([m.positions.mean(axis=1) for m in meshes[:1]])
+        middle, reach = path.mean(axis=0), 2.5 + np.ptp(path, axis=0).max()
+        ground = pyvista.Plane(
+            center=(middle[0], self.floor - 0.002, middle[2]), direction=(0, 1, 0),
+            i_size=2 * reach, j_size=2 * reach, i_resolution=20, j_resolution=20,
+        )
+        self.plotter.add_mesh(ground, color="#b9bec4", show_edges=True, edge_color="#a4a9b0")
+
+    def shoot(self, frame: int) -> np.ndarray:
+        """One frame as an RGB image."""
+        centre = self.meshes[0].positions[frame].mean(axis=0)
+        for m, surface in zip(self.meshes, self.surfaces, strict=True):
+            surface.points = m.positions[frame].copy()
+            surface.compute_normals(inplace=True, cell_normals=False, split_vertices=False,
+                                    consistent_normals=False, auto_orient_normals=False)
+        target = np.array([centre[0], self.floor + 0.9, centre[2]])
+        eye = target + np.array([1.3, 0.5, 3.4])
+        self.plotter.camera_position = [tuple(eye), tuple(target), (0.0, 1.0, 0.0)]
+        self.plotter.camera.view_angle = 32.0
+        return np.asarray(self.plotter.screenshot(return_img=True))
+
+
+def render_frame(
+    meshes: Sequence[AnimatedMesh], frame: int = 0, *, size: tuple[int, int] = (640, 720)
+) -> np.ndarray:
+    """One frame as an RGB image, shape [height, width, 3].
+
+    Raises:
+        MissingDependencyError: Without the ``render`` extra.
+    """
+    stage = _Stage(meshes, size)
+    try:
+        return stage.shoot(frame)
+    finally:
+        stage.plotter.close()
+
+
+def render_preview(
+    path: str | pathlib.Path,
+    meshes: Sequence[AnimatedMesh],
+    fps: float,
+    *,
+    size: tuple[int, int] = (480, 544),
+    progress: Callable[[str, int, int], None] | None = None,
+) -> pathlib.Path:
+    """Renders a clip: ``.mp4``, ``.gif``, or ``.png`` (a sheet of six moments).
+
+    Args:
+        path: Where to; written whole or not at all.
+        meshes: What to show.
+        fps: Frames a second.
+        size: Width and height of a frame; multiples of 16 for video.
+        progress: Called with a text, frames done and frames in all.
+
+    Raises:
+        FormatError: Another extension.
+        MissingDependencyError: Without the ``render`` extra.
+    """
+    path = check_preview(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        import imageio.v3 as iio
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Videos need imageio: pip install 'physxnet-jax[render]'."
+        ) from error
+    frames = len(meshes[0].positions)
+    stage = _Stage(meshes, size)
+    part = path.with_name(f".part-{path.name}")
+    try:
+        if path.suffix == ".png":
+            picks = np.unique(np.linspace(0, frames - 1, 6).astype(int))
+            shots = [stage.shoot(int(k)) for k in picks]
+            iio.imwrite(part, np.concatenate(shots, axis=1), extension=".png")
+        else:
+            stride = 1 if path.suffix == ".mp4" else max(1, round(fps / 15))
+            shots = []
+            for k in range(0, frames, stride):
+                shots.append(stage.shoot(k))
+                if progress is not None:
+                    progress("preview", k + 1, frames)
+            if path.suffix == ".mp4":
+                with warnings.catch_warnings():
+                    # ffmpeg is started by fork and exec: nothing of JAX runs in between.
+                    warnings.filterwarnings("ignore", message=".*os.fork.*")
+                    iio.imwrite(
+                        part, np.stack(shots), fps=fps, extension=".mp4", codec="libx264"
+                    )
+            else:
+                iio.imwrite(part, np.stack(shots), duration=1000 * stride / fps, loop=0, extension=".gif")
+    finally:
+        stage.plotter.close()
+    part.replace(path)
+    return path
+
+
+def check_preview(path: str | pathlib.Path) -> pathlib.Path:
+    """The path, if its extension is one that can be rendered.
+
+    Raises:
+        FormatError: Otherwise.
+    """
+    path = pathlib.Path(path)
+    if path.suffix not in PREVIEWS:
+        raise FormatError(f"{path}: a preview is one of {', '.join(PREVIEWS)}.")
+    return path
