@@ -95,9 +95,7 @@ def joint_rows(end: dict, cubes: dict[str, np.ndarray]) -> np.ndarray:
     """Eight vertices whose mean is one end of a bone."""
     if end["strategy"] == "CUBE":
         return cubes[end["cube_name"]]
-    rows = np.asarray(
-        end["vertex_indices"] if end["strategy"] == "MEAN" else [end["vertex_index"]]
-    )
+    rows = np.asarray(end["vertex_indices"] if end["strategy"] == "MEAN" else [end["vertex_index"]])
     return np.tile(rows, 8 // len(rows))
 
 
@@ -143,13 +141,12 @@ def build(wheel: pathlib.Path) -> dict[str, np.ndarray]:
     for gender in ("female", "male"):
         bases.append(base + read_target(archive, f"caucasian-{gender}-young"))
         deltas.append(
-            [
-                scale * read_target(archive, path.format(g=gender))
-                for path, scale in DELTAS.values()
-            ]
+            [scale * read_target(archive, path.format(g=gender)) for path, scale in DELTAS.values()]
         )
     uv_used = np.unique(
-        np.concatenate([groups[g][..., 1].ravel() for g in ("body", "helper-tights", "helper-skirt")])
+        np.concatenate(
+            [groups[g][..., 1].ravel() for g in ("body", "helper-tights", "helper-skirt")]
+        )
     )
     remap = np.full(len(uv), -1)
     remap[uv_used] = np.arange(len(uv_used))

@@ -1,9 +1,9 @@
 """Clothes on moving people, learned and differentiable, in JAX.
 
-    >>> import physxnet_jax as px
-    >>> clip = px.dress("walk", wear=["bottom"], method="lbs", frames=2)
-    >>> px.write_clip("/tmp/walk.npz", clip.meshes, clip.fps)[0].name
-    'walk.npz'
+>>> import physxnet_jax as px
+>>> clip = px.dress("walk", wear=["bottom"], method="lbs", frames=2)
+>>> px.write_clip("/tmp/walk.npz", clip.meshes, clip.fps)[0].name
+'walk.npz'
 """
 
 from ._environment import check_jaxlib as _check_jaxlib

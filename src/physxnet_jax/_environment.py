@@ -34,8 +34,6 @@ def check_jaxlib() -> None:
     Raises:
         BrokenInstallError: The text names a version to install.
     """
-    problem = jaxlib_problem(
-        importlib.metadata.version("jaxlib"), os.environ.get("XLA_FLAGS", "")
-    )
+    problem = jaxlib_problem(importlib.metadata.version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
     if problem is not None:
         raise BrokenInstallError(problem)

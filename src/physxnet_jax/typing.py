@@ -4,17 +4,16 @@ Axis names are fixed: ``batch frames vertices faces joints height width channels
 (and ``texels``, the covered pixels of an atlas, in row-major order).
 """
 
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
+import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 Vertices: TypeAlias = Float[Array, "vertices 3"] | Float[np.ndarray, "vertices 3"]
 """Vertex positions [m], world frame, Y up."""
 
-Animation: TypeAlias = (
-    Float[Array, "frames vertices 3"] | Float[np.ndarray, "frames vertices 3"]
-)
+Animation: TypeAlias = Float[Array, "frames vertices 3"] | Float[np.ndarray, "frames vertices 3"]
 """Vertex positions [m] of every frame."""
 
 Faces: TypeAlias = Int[Array, "faces 3"] | Int[np.ndarray, "faces 3"]
@@ -29,6 +28,25 @@ Quaternions: TypeAlias = Float[Array, "*batch 4"] | Float[np.ndarray, "*batch 4"
 
 AnyArray: TypeAlias = Shaped[Array, "..."] | Shaped[np.ndarray, "..."]
 
+_Class = TypeVar("_Class", bound=type)
+
+
+def pytree(cls: _Class) -> _Class:
+    """Registers a frozen dataclass as a pytree.
+
+    JAX rebuilds pytrees around whatever it maps over: batched arrays, shapes, mere
+    markers. Their fields' annotations tell the shape of one instance and aren't checked.
+
+    Args:
+        cls: A frozen dataclass; fields with metadata ``static=True`` aren't leaves.
+
+    Returns:
+        The class.
+    """
+    cls.__no_type_check__ = True  # pyright: ignore[reportAttributeAccessIssue]
+    return jax.tree_util.register_dataclass(cls)
+
+
 __all__ = [
     "Animation",
     "AnyArray",
@@ -39,4 +57,5 @@ __all__ = [
     "Quaternions",
     "Texels",
     "Vertices",
+    "pytree",
 ]

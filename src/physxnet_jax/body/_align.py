@@ -62,8 +62,6 @@ def align_bones(
 ) -> Float[np.ndarray, "joints 4"]:
     """Local quaternions (wxyz) of `align_global`."""
     world = align_global(body, targets, shape)
-    local = [
-        r if p < 0 else world[p].inv() * r for r, p in zip(world, body.parents, strict=True)
-    ]
+    local = [r if p < 0 else world[p].inv() * r for r, p in zip(world, body.parents, strict=True)]
     quaternions = np.stack([r.as_quat(scalar_first=True) for r in local])
     return np.where(quaternions[:, :1] < 0, -quaternions, quaternions)

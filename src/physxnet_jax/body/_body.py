@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 
 from ..errors import PhysXNetError
 from ..geometry import TriMesh
+from ..typing import pytree
 from ._kinematics import forward_kinematics, linear_blend_skinning
 
 ASSET = "makehuman_cc0.npz"
@@ -19,7 +20,7 @@ ASSET_SHA256 = "e44596f8c2ddb61ada92901a786f12a83f525bced7ef619f11c3f9d414774676
 NUM_BODY_VERTICES = 13380
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Body:
     """A skinned human body (MakeHuman, CC0) with its helper geometry.
@@ -96,9 +97,7 @@ class Body:
         male = shape[0]
         base = self.bases[0] + male * (self.bases[1] - self.bases[0])
         deltas = self.deltas[0] + male * (self.deltas[1] - self.deltas[0])
-        return base + jnp.tensordot(
-            shape[1:], deltas, axes=1, precision=jax.lax.Precision.HIGHEST
-        )
+        return base + jnp.tensordot(shape[1:], deltas, axes=1, precision=jax.lax.Precision.HIGHEST)
 
     def joint_positions(
         self, rest: Float[Array, "all 3"]
@@ -119,9 +118,7 @@ class Body:
 
     def mesh(self, vertices: Float[Array, "vertices 3"]) -> TriMesh:
         """The body as triangles, with its texture coordinates."""
-        return TriMesh(
-            vertices, triangulate(self.quads), self.uv, triangulate(self.uv_quads)
-        )
+        return TriMesh(vertices, triangulate(self.quads), self.uv, triangulate(self.uv_quads))
 
     def rest_mesh(self, shape: Float[Array, " shapes"] | None = None) -> TriMesh:
         """The body mesh at rest (A-pose); the default shape if none is given."""
@@ -148,9 +145,7 @@ class Body:
                 f"Unknown shape parameter {sorted(unknown)}; there are"
                 f" {', '.join(self.shape_names)}."
             )
-        return jnp.asarray(
-            [values.get(name, 0.0) for name in self.shape_names], jnp.float32
-        )
+        return jnp.asarray([values.get(name, 0.0) for name in self.shape_names], jnp.float32)
 
     def a_pose(self) -> Float[Array, "joints 4"]:
         """The rest pose: arms 45 degrees down. All identities."""
@@ -158,9 +153,7 @@ class Body:
         one[:, 0] = 1.0
         return jnp.asarray(one)
 
-    def t_pose(
-        self, shape: Float[Array, " shapes"] | None = None
-    ) -> Float[Array, "joints 4"]:
+    def t_pose(self, shape: Float[Array, " shapes"] | None = None) -> Float[Array, "joints 4"]:
         """Arms along the X axis, legs straight down, on the host.
 
         Bones are turned by the smallest rotation, the forearm after the upper arm.
@@ -198,13 +191,12 @@ def load_body() -> Body:
     References:
         MakeHuman base mesh hm08, CC0 1.0; see `body/assets/PROVENANCE.md`.
     """
-    resource = importlib.resources.files(__package__) / "assets" / ASSET
+    resource = importlib.resources.files(__name__.rpartition(".")[0]) / "assets" / ASSET
     blob = resource.read_bytes()
     digest = hashlib.sha256(blob).hexdigest()
     if digest != ASSET_SHA256:
         raise PhysXNetError(
-            f"{ASSET}: sha256 is {digest}, expected {ASSET_SHA256}. Reinstall the"
-            " package."
+            f"{ASSET}: sha256 is {digest}, expected {ASSET_SHA256}. Reinstall the package."
         )
     with importlib.resources.as_file(resource) as path, np.load(path) as data:
         return _from_arrays({name: data[name] for name in data.files})

@@ -42,13 +42,9 @@ def forward_kinematics(
             offset = heads[j] - heads[parent]
             up = rotations[parent]
             rotations.append(jnp.matmul(up, local[j], precision=_EXACT))
-            positions.append(
-                positions[parent] + jnp.matmul(up, offset, precision=_EXACT)
-            )
+            positions.append(positions[parent] + jnp.matmul(up, offset, precision=_EXACT))
     world = jnp.stack(rotations)
-    shift = jnp.stack(positions) - jnp.einsum(
-        "jab,jb->ja", world, heads, precision=_EXACT
-    )
+    shift = jnp.stack(positions) - jnp.einsum("jab,jb->ja", world, heads, precision=_EXACT)
     return world, shift
 
 

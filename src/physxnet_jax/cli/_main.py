@@ -64,9 +64,7 @@ def _run(command: Dress | Demo | Doctor | Clips, console: Console) -> int:
     if isinstance(command, Demo):
         out = command.out
         common = {"frames": command.frames, "quiet": command.quiet}
-        jobs = Dress(
-            "walk", out=out / "demo.usdc", preview=out / "demo.mp4", **common
-        )
+        jobs = Dress("walk", out=out / "demo.usdc", preview=out / "demo.mp4", **common)
         return _dress(jobs, console, still=out / "demo.png")
     return _dress(command, console)
 
@@ -87,8 +85,15 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     shape = load_body().shape(**_parse_shape(command.shape)) if command.shape else None
     if command.quiet:
         console = Console(quiet=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed}/{task.total}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(
+        *columns, console=console, transient=True, disable=not console.is_terminal
+    ) as bar:
         tasks: dict[str, int] = {}
 
         def progress(name: str, done: int, total: int) -> None:
@@ -97,13 +102,21 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
             bar.update(tasks[name], completed=done)  # pyright: ignore[reportArgumentType]
 
         motion = load_motion(
-            command.motion, fps=command.fps, source_fps=command.source_fps,
+            command.motion,
+            fps=command.fps,
+            source_fps=command.source_fps,
             skeleton=command.skeleton,
         )
         clip = dress(
-            motion, command.wear, method=command.method, frames=command.frames,
-            weights=command.weights, shape=shape, include_body=command.body,
-            resolve=command.push_out, progress=progress,
+            motion,
+            command.wear,
+            method=command.method,
+            frames=command.frames,
+            weights=command.weights,
+            shape=shape,
+            include_body=command.body,
+            resolve=command.push_out,
+            progress=progress,
         )
         written: list[pathlib.Path] = []
         if command.out is not None:

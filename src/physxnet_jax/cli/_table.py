@@ -18,7 +18,14 @@ def closing_table(clip: DressedClip) -> list[Table]:
         warm = "" if stage.warm_ms is None else f"{stage.warm_ms:.2f}"
         times.add_row(stage.name, f"{stage.cold_ms:.0f}", warm)
     fit = Table(title="garments", title_justify="left")
-    for name in ("garment", "vertices", "ray hit rate", "fallbacks", "inside body (raw)", "inside body"):
+    for name in (
+        "garment",
+        "vertices",
+        "ray hit rate",
+        "fallbacks",
+        "inside body (raw)",
+        "inside body",
+    ):
         fit.add_column(name, justify="left" if name == "garment" else "right")
     for m in clip.garments:
         fit.add_row(

@@ -55,9 +55,7 @@ def build_dataset(
         scene = prepared[1]
         rollout = simulate_batch(scene, [motion], solver=solver)[0]
         offsets = rollout.positions[0] - skinned_cloth(scene, motion)
-        worst = {
-            key: float(np.max(v)) for key, v in rollout.diagnostics.items() if key != "finite"
-        }
+        worst = {key: float(np.max(v)) for key, v in rollout.diagnostics.items() if key != "finite"}
         write_offsets(
             target,
             name,

@@ -51,9 +51,7 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
     folder = pathlib.Path(folder)
     table = folder / "ACTIONS.csv"
     if not table.is_file():
-        raise MotionError.at(
-            table, None, "no such file", "Name the folder that holds ACTIONS.csv"
-        )
+        raise MotionError.at(table, None, "no such file", "Name the folder that holds ACTIONS.csv")
     rates: dict[str, float] = {}
     clips = folder / "CLIPS.csv"
     if clips.is_file():

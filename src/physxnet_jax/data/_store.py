@@ -39,7 +39,9 @@ class Sequence:
 
 
 def write_offsets(
-    folder: pathlib.Path, template: str, offsets: Float[np.ndarray, "frames vertices 3"],
+    folder: pathlib.Path,
+    template: str,
+    offsets: Float[np.ndarray, "frames vertices 3"],
     meta: dict[str, Any],
 ) -> None:
     """One garment of one action; it appears whole or not at all.
@@ -70,9 +72,7 @@ def write_offsets(
                 "data_type": "int16",
                 "chunk_grid": {
                     "name": "regular",
-                    "configuration": {
-                        "chunk_shape": [min(64, whole.shape[0]), *whole.shape[1:]]
-                    },
+                    "configuration": {"chunk_shape": [min(64, whole.shape[0]), *whole.shape[1:]]},
                 },
                 "codecs": [
                     {"name": "bytes", "configuration": {"endian": "little"}},

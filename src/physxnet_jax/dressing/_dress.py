@@ -33,7 +33,7 @@ from ..motion import (
     load_motion,
     padded_block,
 )
-from ..simulation import Scene, XPBD, prepare_scene, simulate_batch
+from ..simulation import XPBD, Scene, prepare_scene, simulate_batch
 from ..uv import Binding, Transference, bind
 from ._push_out import SkinPatch, make_patch, push_out, skin_height
 
@@ -148,7 +148,9 @@ def dress(
             clip = Motion(clip.rotations[:frames], clip.root[:frames], clip.fps, clip.name)
         world, shift = clip_transforms(body, rest, clip)
     with watch("garments"):
-        garments = _named([g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear])
+        garments = _named(
+            [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
+        )
     hits = {g.name: 1.0 for g in garments}
     fallbacks = {g.name: 0 for g in garments}
     predictor = None
@@ -167,8 +169,10 @@ def dress(
     if method == "simulate":
         positions = _simulate(garments, clip, body, shape, stages, progress)
     else:
-        positions = _predict(predictor, wearables, patches, world, shift, clip.fps, resolve, stages, progress)
-    inside_raw = positions.pop("inside_raw", None)
+        positions = _predict(
+            predictor, wearables, patches, world, shift, clip.fps, resolve, stages, progress
+        )
+    inside_raw: Any = positions.pop("inside_raw", None)
     inside = {
         w.name: _inside_share(p, positions[w.name], world, shift)
         for w, p in zip(wearables, patches, strict=True)
@@ -180,8 +184,12 @@ def dress(
         mesh = body.rest_mesh()
         meshes.append(
             AnimatedMesh(
-                "body", skin, np.asarray(mesh.faces), np.asarray(mesh.uv),
-                np.asarray(mesh.uv_faces), _SKIN_COLOUR,
+                "body",
+                skin,
+                np.asarray(mesh.faces),
+                np.asarray(mesh.uv),
+                np.asarray(mesh.uv_faces),
+                _SKIN_COLOUR,
             )
         )
     for k, g in enumerate(garments):
@@ -189,13 +197,23 @@ def dress(
         uv_faces = None if g.mesh.uv_faces is None else np.asarray(g.mesh.uv_faces)
         meshes.append(
             AnimatedMesh(
-                g.name, positions[g.name], np.asarray(g.mesh.faces), uv, uv_faces,
+                g.name,
+                positions[g.name],
+                np.asarray(g.mesh.faces),
+                uv,
+                uv_faces,
                 _COLOURS[k % len(_COLOURS)],
             )
         )
     return DressedClip(
-        tuple(meshes), clip.fps, tuple(stages), hits, fallbacks,
-        inside if inside_raw is None else inside_raw, inside, method,
+        tuple(meshes),
+        clip.fps,
+        tuple(stages),
+        hits,
+        fallbacks,
+        inside if inside_raw is None else inside_raw,
+        inside,
+        method,
     )
 
 
@@ -243,13 +261,16 @@ def _bound(predictor: Predictor, body: Body, rest: Array, garment: Garment) -> W
 def unbound_wearable(body: Body, rest: Float[Array, "all 3"], garment: Garment) -> Wearable:
     """A garment for skinning alone, tied to no atlas."""
     n = garment.num_vertices
-    rows = Transference(
-        jnp.zeros((n, 3), jnp.int32), jnp.zeros((n, 3)), jnp.zeros((n,), bool)
-    )
+    rows = Transference(jnp.zeros((n, 3), jnp.int32), jnp.zeros((n, 3)), jnp.zeros((n,), bool))
     none = Binding(rows, jnp.zeros((n, 4), jnp.int32), jnp.zeros((n, 4)), 1.0, 0, 0)
     return Wearable(
-        garment.rest_vertices(rest), garment.skin, none, garment.rest_vertices(rest),
-        garment.skin, garment.template, garment.name,
+        garment.rest_vertices(rest),
+        garment.skin,
+        none,
+        garment.rest_vertices(rest),
+        garment.skin,
+        garment.template,
+        garment.name,
     )
 
 
@@ -297,10 +318,13 @@ def _predict(
     for start in range(0, frames, BLOCK):
         began = time.perf_counter()
         out = dress_block(
-            predictor, tuple(wearables), tuple(patches),
+            predictor,
+            tuple(wearables),
+            tuple(patches),
             jnp.asarray(padded_block(world, start, WINDOW - 1)),
             jnp.asarray(padded_block(shift, start, WINDOW - 1)),
-            fps, resolve,
+            fps,
+            resolve,
         )
         blocks.append(jax.tree.map(np.asarray, out))
         times.append(1e3 * (time.perf_counter() - began))
@@ -311,7 +335,9 @@ def _predict(
     result: dict[str, Any] = {"inside_raw": {}}
     for k, w in enumerate(wearables):
         result[w.name] = np.concatenate([b[k][0] for b in blocks])[:frames]
-        result["inside_raw"][w.name] = float(np.concatenate([b[k][1] for b in blocks])[:frames].mean())
+        result["inside_raw"][w.name] = float(
+            np.concatenate([b[k][1] for b in blocks])[:frames].mean()
+        )
     return result
 
 
@@ -350,7 +376,9 @@ def _inside_share(
     shares = []
     for start in range(0, len(positions), BLOCK):
         height = _heights(
-            patch, padded_block(positions, start, 0), padded_block(world, start, 0),
+            patch,
+            padded_block(positions, start, 0),
+            padded_block(world, start, 0),
             padded_block(shift, start, 0),
         )
         shares.append(np.asarray(height < 0)[: len(positions) - start].mean(axis=1))

@@ -10,9 +10,10 @@ from jaxtyping import Array, Float, Int
 from ..body import NUM_BODY_VERTICES, Body
 from ..geometry import TriMesh, closest_among, nearby_faces, safe_normalize, vertex_normals
 from ..models import Wearable, skin_points
+from ..typing import pytree
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class SkinPatch:
     """The skin near each garment vertex.

@@ -63,8 +63,8 @@ def cut(
         np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])),
         axis=0,
     )
-    rows = rows.tolil()
-    base = rows.copy().tocsr()
+    table = rows.tolil()
+    base = sp.csr_matrix(rows)
     crossing = edges[f[edges[:, 0]] * f[edges[:, 1]] < 0]
     best = np.full(len(f), _SNAP)
     partner = np.full(len(f), -1)
@@ -73,9 +73,9 @@ def cut(
         if t < best[a]:
             best[a], partner[a] = t, b
     for a in np.flatnonzero(partner >= 0):
-        rows[a] = (1 - best[a]) * base[a] + best[a] * base[partner[a]]
+        table[a] = (1 - best[a]) * base[a] + best[a] * base[partner[a]]
     f[partner >= 0] = 0.0
-    base = rows.tocsr()
+    base = sp.csr_matrix(table)
     extra: dict[tuple[int, int], int] = {}
     mixed: list[sp.csr_matrix] = []
 
@@ -104,7 +104,8 @@ def cut(
     remap[used] = np.arange(len(used))
     stacked = sp.csr_matrix(sp.vstack([base, *mixed]))
     origin = np.where(used < len(f), used, -1)
-    return sp.csr_matrix(stacked[used]), remap[out], origin
+    picked: sp.csr_matrix = stacked[used]  # pyright: ignore[reportOptionalSubscript, reportAssignmentType]
+    return picked, remap[out], origin
 
 
 def pad_rows(
@@ -113,13 +114,14 @@ def pad_rows(
     """Mixtures as index and weight tables, padded with zero weights."""
     rows = sp.csr_matrix(rows)
     rows.sum_duplicates()
-    count = np.diff(rows.indptr)
-    index = np.zeros((rows.shape[0], count.max()), dtype=np.int32)
-    weight = np.zeros((rows.shape[0], count.max()), dtype=np.float32)
-    for i in range(rows.shape[0]):
-        part = slice(rows.indptr[i], rows.indptr[i + 1])
-        index[i, : count[i]] = rows.indices[part]
-        weight[i, : count[i]] = rows.data[part]
+    indptr, indices, data = (np.asarray(x) for x in (rows.indptr, rows.indices, rows.data))
+    count = np.diff(indptr)
+    index = np.zeros((len(count), count.max()), dtype=np.int32)
+    weight = np.zeros((len(count), count.max()), dtype=np.float32)
+    for i in range(len(count)):
+        part = slice(indptr[i], indptr[i + 1])
+        index[i, : count[i]] = indices[part]
+        weight[i, : count[i]] = data[part]
     return index, weight
 
 
@@ -167,7 +169,7 @@ def refine(
             # The longest edge of all is always the longest of its faces but for ties.
             flat = length[lane, longest]
             chosen = [tuple(key[int(np.argmax(np.where(long, flat, 0)))])]
-        table = {e: rows.shape[0] + k for k, e in enumerate(chosen)}
+        table = {e: len(p) + k for k, e in enumerate(chosen)}
         ends = np.asarray(chosen)
         rows = sp.csr_matrix(sp.vstack([rows, 0.5 * (rows[ends[:, 0]] + rows[ends[:, 1]])]))
         out = []

@@ -156,9 +156,7 @@ def relax_crossings(
     return v
 
 
-def smoothing_matrix(
-    faces: Int[np.ndarray, "faces 3"], num_vertices: int
-) -> sp.csr_matrix:
+def smoothing_matrix(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> sp.csr_matrix:
     """Averages each vertex with its neighbours, half and half."""
     e = mesh_edges(faces).vertices
     ones = np.ones(len(e))

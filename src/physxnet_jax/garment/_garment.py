@@ -3,11 +3,11 @@
 import dataclasses
 from typing import Literal
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry import TriMesh
+from ..typing import pytree
 
 Template = Literal["top", "bottom", "dress"]
 TEMPLATES: tuple[Template, ...] = ("top", "bottom", "dress")
@@ -37,7 +37,7 @@ COTTON = Fabric()
 shirtings (1 to 5 x 10^-5 N m), stretching as stiff as 32 substeps carry."""
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Garment:
     """A garment at rest, on the body in its rest pose.

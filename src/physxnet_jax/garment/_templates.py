@@ -98,7 +98,7 @@ def template(name: Template) -> Garment:
     """
     if name not in TEMPLATES:
         raise MeshError(f"No template '{name}'; there are {', '.join(TEMPLATES)}.")
-    resource = importlib.resources.files(__package__) / "assets" / ASSET
+    resource = importlib.resources.files(__name__.rpartition(".")[0]) / "assets" / ASSET
     with importlib.resources.as_file(resource) as path, np.load(path) as data:
         part = {k: data[f"{name}_{k}"] for k in _STORED}
     fabric = Fabric(*(float(x) for x in part["fabric"]))
@@ -119,7 +119,14 @@ def template(name: Template) -> Garment:
 
 
 _STORED = (
-    "vertices", "faces", "uv", "pinned", "refs", "ref_weights", "offset", "fabric",
+    "vertices",
+    "faces",
+    "uv",
+    "pinned",
+    "refs",
+    "ref_weights",
+    "offset",
+    "fabric",
 )
 
 
@@ -217,7 +224,7 @@ def _weld_skirt(piece: _Cut, rest: np.ndarray, body: Body) -> _Cut:
     angle = np.arctan2(p[loop, 0] - centre[0], p[loop, 2] - centre[2])
     ring_points = np.stack([_at_angles(ring, angle, rest)[1] for ring in rings])
     ring_rows = [_at_angles(ring, angle, rest)[0] for ring in rings]
-    steps = int(round((p[loop, 1].mean() - _DRESS_HEM) / _SKIRT_ROW))
+    steps = round((p[loop, 1].mean() - _DRESS_HEM) / _SKIRT_ROW)
     first = p[loop, 1]
     blocks: list[sp.csr_matrix] = []
     for s in range(1, steps + 1):
@@ -294,9 +301,7 @@ def _at_angles(
     return rows, rows @ rest
 
 
-def _targets(
-    name: Template, p: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _targets(name: Template, p: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Wanted clearance [m] and where the cloth may stand farther off."""
     free = np.zeros(len(p))
     if name == "top":

@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ._topology import vertex_faces
 
@@ -31,5 +31,5 @@ def nearby_faces(
     around = vertex_faces(faces, len(vertices))
     used = np.unique(faces)
     k = min(neighbours, len(used))
-    near = cKDTree(vertices[used]).query(points, k=k)[1].reshape(len(points), k)
+    near = KDTree(vertices[used]).query(points, k=k)[1].reshape(len(points), k)
     return around[used[near]].reshape(len(points), -1)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..typing import pytree
 from ._mesh import TriMesh
 from ._normals import face_normals, vertex_normals
 from ._rotation import safe_normalize
@@ -15,7 +16,7 @@ from ._topology import mesh_edges
 _FACE_CHUNK = 256
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class ClosestPoints:
     """Closest points of a mesh.
@@ -54,38 +55,36 @@ def closest_barycentric(
     References:
         Ericson, Real-Time Collision Detection (2005), section 5.1.5.
     """
-    ab, ac, ap = b - a, c - a, p - a
-    d1, d2 = _dot(ab, ap), _dot(ac, ap)
-    bp = p - b
-    d3, d4 = _dot(ab, bp), _dot(ac, bp)
-    cp = p - c
-    d5, d6 = _dot(ab, cp), _dot(ac, cp)
-    va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
-    zero, one = jnp.zeros_like(d1), jnp.ones_like(d1)
+    ab, ac, bc = b - a, c - a, c - b
+    ap, bp = p - a, p - b
+    zero, one = jnp.zeros_like(ap[0]), jnp.ones_like(ap[0])
 
     def ratio(num: Array, den: Array) -> Array:
         ok = den > 0
         return jnp.where(ok, num / jnp.where(ok, den, one), zero)
 
-    total = va + vb + vc
-    v, w = ratio(vb, total), ratio(vc, total)
-    edge_bc = (va <= 0) & (d4 - d3 >= 0) & (d5 - d6 >= 0)
-    t = ratio(d4 - d3, (d4 - d3) + (d5 - d6))
-    v, w = jnp.where(edge_bc, 1 - t, v), jnp.where(edge_bc, t, w)
-    edge_ac = (vb <= 0) & (d2 >= 0) & (d6 <= 0)
-    v = jnp.where(edge_ac, zero, v)
-    w = jnp.where(edge_ac, ratio(d2, d2 - d6), w)
-    edge_ab = (vc <= 0) & (d1 >= 0) & (d3 <= 0)
-    v = jnp.where(edge_ab, ratio(d1, d1 - d3), v)
-    w = jnp.where(edge_ab, zero, w)
-    at_c = (d6 >= 0) & (d5 <= d6)
-    v, w = jnp.where(at_c, zero, v), jnp.where(at_c, one, w)
-    at_b = (d3 >= 0) & (d4 <= d3)
-    v, w = jnp.where(at_b, one, v), jnp.where(at_b, zero, w)
-    at_a = (d1 <= 0) & (d2 <= 0)
-    v, w = jnp.where(at_a, zero, v), jnp.where(at_a, zero, w)
-    gap = ap - v[None] * ab - w[None] * ac
-    return jnp.stack([1 - v - w, v, w]), _dot(gap, gap)
+    # The nearest of the three edges, each by itself: right for any degeneracy.
+    t = jnp.clip(ratio(_dot(ab, ap), _dot(ab, ab)), 0.0, 1.0)
+    gap = ap - t[None] * ab
+    v, w, best = t, zero, _dot(gap, gap)
+    for base, edge, is_bc in ((ap, ac, False), (bp, bc, True)):
+        t = jnp.clip(ratio(_dot(edge, base), _dot(edge, edge)), 0.0, 1.0)
+        gap = base - t[None] * edge
+        squared = _dot(gap, gap)
+        near = squared < best
+        v = jnp.where(near, 1 - t if is_bc else zero, v)
+        w = jnp.where(near, t, w)
+        best = jnp.where(near, squared, best)
+    # The interior, where the foot of the perpendicular lies in it.
+    d00, d01, d11 = _dot(ab, ab), _dot(ab, ac), _dot(ac, ac)
+    d20, d21 = _dot(ap, ab), _dot(ap, ac)
+    det = d00 * d11 - d01 * d01
+    v_in, w_in = ratio(d11 * d20 - d01 * d21, det), ratio(d00 * d21 - d01 * d20, det)
+    gap = ap - v_in[None] * ab - w_in[None] * ac
+    squared = _dot(gap, gap)
+    inside = (det > 0) & (v_in > 0) & (w_in > 0) & (v_in + w_in < 1) & (squared <= best)
+    v, w = jnp.where(inside, v_in, v), jnp.where(inside, w_in, w)
+    return jnp.stack([1 - v - w, v, w]), jnp.where(inside, squared, best)
 
 
 def _dot(x: Array, y: Array) -> Array:
@@ -93,9 +92,7 @@ def _dot(x: Array, y: Array) -> Array:
 
 
 @jax.jit
-def closest_points(
-    mesh: TriMesh, points: Float[Array, "points 3"]
-) -> ClosestPoints:
+def closest_points(mesh: TriMesh, points: Float[Array, "points 3"]) -> ClosestPoints:
     """Exact closest points by comparing with every face, a chunk of faces at a time.
 
     Memory is bounded by points x 256 faces. Time is points x faces: for repeated
@@ -120,9 +117,7 @@ def closest_points(
         best_d, best_f, best_w = carry
         corner = [mesh.vertices[faces[block, k]].T[:, :, None] for k in range(3)]
         q = jnp.broadcast_to(p, (3, chunk, points.shape[0]))
-        w, d = closest_barycentric(
-            q, *(jnp.broadcast_to(x, q.shape) for x in corner)
-        )
+        w, d = closest_barycentric(q, *(jnp.broadcast_to(x, q.shape) for x in corner))
         near = jnp.argmin(d, axis=0)
         lane = jnp.arange(points.shape[0])
         d, w, f = d[near, lane], w[:, near, lane], block[near]
@@ -158,9 +153,7 @@ def closest_among(
     Returns:
         As `closest_points`, over the candidates only.
     """
-    corner = [
-        jnp.moveaxis(mesh.vertices[mesh.faces[candidates, k]], -1, 0) for k in range(3)
-    ]
+    corner = [jnp.moveaxis(mesh.vertices[mesh.faces[candidates, k]], -1, 0) for k in range(3)]
     p = jnp.broadcast_to(points.T[:, :, None], corner[0].shape)
     w, d = closest_barycentric(p, *corner)
     near = jnp.argmin(d, axis=1)
@@ -199,9 +192,7 @@ def signed_distance(
     second = jnp.where(beside[:, 1] >= 0, beside[:, 1], beside[:, 0])
     edge_normals = normals[beside[:, 0]] + normals[second]
     corner_normals = vertex_normals(mesh.vertices, mesh.faces)
-    return _sign(
-        mesh, points, hit, normals, edge_normals, corner_normals, edges.of_face
-    )
+    return _sign(mesh, points, hit, normals, edge_normals, corner_normals, edges.of_face)
 
 
 def _sign(

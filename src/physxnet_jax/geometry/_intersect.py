@@ -2,7 +2,7 @@
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ._topology import mesh_edges
 
@@ -29,13 +29,11 @@ def self_intersections(
     reach = 0.5 * np.linalg.norm(v[e[:, 0]] - v[e[:, 1]], axis=1)
     centre = v[f].mean(axis=1)
     radius = np.linalg.norm(v[f] - centre[:, None], axis=2).max(axis=1)
-    tree = cKDTree(centre)
+    tree = KDTree(centre)
     near = tree.query_ball_point(mid, reach + radius.max())
     edge = np.repeat(np.arange(len(e)), [len(n) for n in near])
     face = np.concatenate([np.asarray(n, dtype=np.int64) for n in near])
-    close = (
-        np.linalg.norm(mid[edge] - centre[face], axis=1) <= reach[edge] + radius[face]
-    )
+    close = np.linalg.norm(mid[edge] - centre[face], axis=1) <= reach[edge] + radius[face]
     shared = (e[edge][:, :, None] == f[face][:, None, :]).any(axis=(1, 2))
     edge, face = edge[close & ~shared], face[close & ~shared]
     p, q = v[e[edge, 0]], v[e[edge, 1]]
@@ -46,8 +44,6 @@ def self_intersections(
 
     sides = volume(a, b, c, p) * volume(a, b, c, q) < 0
     s = [volume(p, q, a, b), volume(p, q, b, c), volume(p, q, c, a)]
-    through = ((s[0] > 0) & (s[1] > 0) & (s[2] > 0)) | (
-        (s[0] < 0) & (s[1] < 0) & (s[2] < 0)
-    )
+    through = ((s[0] > 0) & (s[1] > 0) & (s[2] > 0)) | ((s[0] < 0) & (s[1] < 0) & (s[2] < 0))
     hit = sides & through
     return np.column_stack([edge[hit], face[hit]])

@@ -2,15 +2,15 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..errors import MeshError
+from ..typing import pytree
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class TriMesh:
     """A triangle mesh.
@@ -63,9 +63,7 @@ def make_mesh(
     v = np.asarray(vertices, dtype=np.float32)
     f = np.asarray(faces, dtype=np.int64)
     if v.ndim != 2 or v.shape[1] != 3:
-        raise MeshError(
-            f"{name}: vertices have shape {v.shape}, expected [vertices, 3]."
-        )
+        raise MeshError(f"{name}: vertices have shape {v.shape}, expected [vertices, 3].")
     if f.ndim != 2 or f.shape[-1] != 3 or len(f) == 0:
         raise MeshError(
             f"{name}: faces have shape {f.shape}, expected [faces, 3] with at least one"
@@ -78,9 +76,7 @@ def make_mesh(
         )
     if not np.isfinite(v).all():
         row = int(np.argwhere(~np.isfinite(v).all(axis=1))[0, 0])
-        raise MeshError(
-            f"{name}: vertex {row} is not finite ({v[row].tolist()}). Export it again."
-        )
+        raise MeshError(f"{name}: vertex {row} is not finite ({v[row].tolist()}). Export it again.")
     if uv is None:
         return TriMesh(jnp.asarray(v), jnp.asarray(f.astype(np.int32)))
     t = np.asarray(uv, dtype=np.float32)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..typing import pytree
 from ._mesh import TriMesh
 from ._topology import mesh_edges
 
@@ -14,7 +15,7 @@ from ._topology import mesh_edges
 _CHUNK = 64
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class RayHits:
     """Nearest hits of rays.
@@ -114,8 +115,8 @@ def _cast(
         jnp.pad(directions, pad).reshape(-1, chunk, 3),
     )
     hits = jax.lax.map(
-        lambda od: _cast_chunk(
-            vertices, faces, edges, of_face, sign, *od, max_distance, both
+        lambda ray: _cast_chunk(
+            vertices, faces, edges, of_face, sign, ray[0], ray[1], max_distance, both
         ),
         blocks,
     )
@@ -151,9 +152,7 @@ def _cast_chunk(
         # A permutation by selection: exact, unlike a product with 0 and 1 summed in
         # floating point would be for infinities.
         one = onehot[k][:, None, :] > 0
-        return jnp.where(
-            one[0], relative[0], jnp.where(one[1], relative[1], relative[2])
-        )
+        return jnp.where(one[0], relative[0], jnp.where(one[1], relative[1], relative[2]))
 
     z = axis(2)
     x = axis(0) - sx[None] * z
@@ -166,9 +165,7 @@ def _cast_chunk(
     det = u + v + w
     inside &= (det != 0) & usable[None]
     inverse = 1.0 / jnp.where(det != 0, det, jnp.ones_like(det))
-    t = (
-        u * depth[faces[:, 0]] + v * depth[faces[:, 1]] + w * depth[faces[:, 2]]
-    ) * inverse
+    t = (u * depth[faces[:, 0]] + v * depth[faces[:, 1]] + w * depth[faces[:, 2]]) * inverse
     reach = jnp.abs(t) if both else jnp.where(t >= 0, t, jnp.inf)
     reach = jnp.where(inside & (reach <= max_distance), reach, jnp.inf)
     best = jnp.argmin(reach, axis=0)

@@ -46,9 +46,7 @@ def quaternion_from_axis_angle(
     squared = jnp.sum(rotvec * rotvec, axis=-1, keepdims=True)
     small = squared < _SMALL
     angle = jnp.sqrt(jnp.where(small, jnp.ones_like(squared), squared))
-    half_sinc = jnp.where(
-        small, 0.5 - squared / 48.0, jnp.sin(0.5 * angle) / angle
-    )
+    half_sinc = jnp.where(small, 0.5 - squared / 48.0, jnp.sin(0.5 * angle) / angle)
     cos = jnp.where(small, 1.0 - squared / 8.0, jnp.cos(0.5 * angle))
     return jnp.concatenate([cos, half_sinc * rotvec], axis=-1)
 

@@ -150,8 +150,7 @@ def greedy_colours(
         colour[i] = free
         used[members, free] = True
     return [
-        np.flatnonzero(colour == c).astype(np.int32)
-        for c in range(int(colour.max(initial=-1)) + 1)
+        np.flatnonzero(colour == c).astype(np.int32) for c in range(int(colour.max(initial=-1)) + 1)
     ]
 
 
@@ -163,9 +162,7 @@ def manifold_report(
     edges = mesh_edges(f)
     rows = np.sort(f, axis=1)
     half = np.concatenate([f[:, [1, 2]], f[:, [2, 0]], f[:, [0, 1]]])
-    repeated: Bool[np.ndarray, " n"] = (
-        np.unique(half, axis=0, return_counts=True)[1] > 1
-    )
+    repeated: Bool[np.ndarray, " n"] = np.unique(half, axis=0, return_counts=True)[1] > 1
     return {
         "boundary_edges": int((edges.count == 1).sum()),
         "non_manifold_edges": int((edges.count > 2).sum()),

@@ -6,7 +6,7 @@ import pathlib
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..body import Body, load_body
 from ..errors import MeshError
@@ -88,8 +88,14 @@ def load_garment(
     if str(path) in TEMPLATES:
         g = template(str(path))  # pyright: ignore[reportArgumentType]
         report = GarmentReport(
-            "m", "Y", g.num_vertices, g.mesh.faces.shape[0],
-            manifold_report(np.asarray(g.mesh.faces)), 0.0, 0.01, g.template,
+            "m",
+            "Y",
+            g.num_vertices,
+            g.mesh.faces.shape[0],
+            manifold_report(np.asarray(g.mesh.faces)),
+            0.0,
+            0.01,
+            g.template,
         )
         return g, report
     path = pathlib.Path(path)
@@ -134,8 +140,14 @@ def load_garment(
         path.stem,
     )
     report = GarmentReport(
-        unit, up, len(v), len(raw.faces), manifold_report(raw.faces),
-        float(inside.mean()), float(np.median(np.abs(distance))), kind,
+        unit,
+        up,
+        len(v),
+        len(raw.faces),
+        manifold_report(raw.faces),
+        float(inside.mean()),
+        float(np.median(np.abs(distance))),
+        kind,
     )
     return garment, report
 
@@ -144,7 +156,7 @@ def _place(
     path: pathlib.Path, vertices: np.ndarray, skin: np.ndarray
 ) -> tuple[Float[np.ndarray, "vertices 3"], str, str]:
     """The unit and axis that bring the mesh closest to the skin."""
-    tree = cKDTree(skin)
+    tree = KDTree(skin)
     floor = np.array([0.0, float(skin[:, 1].min()), 0.0])
     best = (np.inf, vertices, "m", "Y")
     for up in ("Y", "Z"):

@@ -64,14 +64,14 @@ def read_obj(path: str | pathlib.Path) -> ObjMesh:
         elif words[0] == "vt":
             uv.append(_floats(path, n, words[1:3], 2))
         elif words[0] == "f":
-            polygons.append(
-                [_corner(path, n, w, len(vertices), len(uv)) for w in words[1:]]
-            )
+            polygons.append([_corner(path, n, w, len(vertices), len(uv)) for w in words[1:]])
             where.append(n)
             if len(polygons[-1]) < 3:
                 raise FormatError(f"{path}:{n}: a face of {len(words) - 1} corners. Delete it.")
     if not vertices or not polygons:
-        raise FormatError(f"{path}: {len(vertices)} vertices and {len(polygons)} faces; a mesh needs both.")
+        raise FormatError(
+            f"{path}: {len(vertices)} vertices and {len(polygons)} faces; a mesh needs both."
+        )
     v = np.asarray(vertices)
     for n, polygon in zip(where, polygons, strict=True):
         for a, t in polygon:
@@ -117,7 +117,9 @@ def _floats(path: pathlib.Path, n: int, words: list[str], count: int) -> list[fl
     try:
         out = [float(w) for w in words]
     except ValueError:
-        raise FormatError(f"{path}:{n}: '{' '.join(words)[:60]}' aren't numbers. Export again.") from None
+        raise FormatError(
+            f"{path}:{n}: '{' '.join(words)[:60]}' aren't numbers. Export again."
+        ) from None
     if len(out) != count or not np.isfinite(out).all():
         raise FormatError(f"{path}:{n}: expected {count} finite numbers, got {out}. Export again.")
     return out

@@ -11,9 +11,7 @@ from ..errors import FormatError
 _HEADER = struct.Struct("<12siiffi")
 
 
-def write_pc2(
-    path: str | pathlib.Path, positions: Float[np.ndarray, "frames vertices 3"]
-) -> None:
+def write_pc2(path: str | pathlib.Path, positions: Float[np.ndarray, "frames vertices 3"]) -> None:
     """Writes a cache of positions [m], one sample a frame from frame 0, atomically."""
     path = pathlib.Path(path)
     frames, vertices, _ = positions.shape

@@ -1,3 +1,4 @@
+# pyright: reportAttributeAccessIssue=false
 """USD: constant topology, time samples, metres, Y up."""
 
 import pathlib
@@ -10,9 +11,7 @@ from ..errors import MissingDependencyError
 from ._clip import AnimatedMesh, smooth_normals, vertex_velocities
 
 
-def write_usd(
-    path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float
-) -> None:
+def write_usd(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
     """Writes meshes as one animated stage.
 
     Each mesh is a prim under ``/Person`` with points, normals, velocities and extent
@@ -51,7 +50,9 @@ def write_usd(
 
     for m in meshes:
         name = re.sub(r"\W", "_", m.name) or "mesh"
-        prim = UsdGeom.Mesh.Define(stage, f"/Person/{name if not name[0].isdigit() else '_' + name}")
+        prim = UsdGeom.Mesh.Define(
+            stage, f"/Person/{name if not name[0].isdigit() else '_' + name}"
+        )
         prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(m.faces), 3, np.int32)))
         prim.CreateFaceVertexIndicesAttr(
             Vt.IntArray.FromNumpy(np.ascontiguousarray(m.faces.reshape(-1), dtype=np.int32))

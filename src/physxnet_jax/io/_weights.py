@@ -29,7 +29,11 @@ _TENSORS, _CARD = "weights.safetensors", "card.json"
 
 
 def save_predictor(
-    folder: str | pathlib.Path, predictor: Predictor, *, name: str, card: dict[str, Any] | None = None
+    folder: str | pathlib.Path,
+    predictor: Predictor,
+    *,
+    name: str,
+    card: dict[str, Any] | None = None,
 ) -> None:
     """Writes a predictor: half-precision weights, masks, and a card.
 
@@ -42,6 +46,7 @@ def save_predictor(
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     leaves = jax.tree.leaves(predictor.state)
+    tensors: dict[str, np.ndarray]
     tensors = {f"leaf_{k:03d}": np.asarray(x).astype(np.float16) for k, x in enumerate(leaves)}
     for t, mask in predictor.surface.valid.items():
         tensors[f"valid_{t}"] = np.packbits(np.asarray(mask))
@@ -67,7 +72,7 @@ def save_predictor(
 
 def list_weights() -> list[str]:
     """Names of the weights in the package."""
-    root = importlib.resources.files(__package__) / "weights"
+    root = importlib.resources.files(__name__.rpartition(".")[0]) / "weights"
     return sorted(p.name for p in root.iterdir() if (p / _CARD).is_file()) if root.is_dir() else []
 
 
@@ -136,7 +141,7 @@ def _folder(weights: str | pathlib.Path) -> pathlib.Path:
     path = pathlib.Path(weights)
     if (path / _CARD).is_file():
         return path
-    root = importlib.resources.files(__package__) / "weights" / str(weights)
+    root = importlib.resources.files(__name__.rpartition(".")[0]) / "weights" / str(weights)
     packaged = pathlib.Path(str(root))
     if not (packaged / _CARD).is_file():
         raise WeightsError(

@@ -24,12 +24,22 @@ class Down(nnx.Module):
     """
 
     def __init__(
-        self, inputs: int, outputs: int, *, norm: bool = True, slope: float = 0.0,
+        self,
+        inputs: int,
+        outputs: int,
+        *,
+        norm: bool = True,
+        slope: float = 0.0,
         rngs: nnx.Rngs,
     ) -> None:
         self.conv = nnx.Conv(
-            inputs, outputs, (4, 4), strides=2, padding=((1, 1), (1, 1)),
-            use_bias=not norm, rngs=rngs,
+            inputs,
+            outputs,
+            (4, 4),
+            strides=2,
+            padding=((1, 1), (1, 1)),
+            use_bias=not norm,
+            rngs=rngs,
         )
         self.norm = batch_norm(outputs, rngs) if norm else None
         self.slope = slope
@@ -94,9 +104,7 @@ class Up(nnx.Module):
         PhysXNet, section 3.2, decoder layer.
     """
 
-    def __init__(
-        self, inputs: int, outputs: int, *, norm: bool = True, rngs: nnx.Rngs
-    ) -> None:
+    def __init__(self, inputs: int, outputs: int, *, norm: bool = True, rngs: nnx.Rngs) -> None:
         init = nnx.initializers.lecun_normal()
         # Each output pixel sees a quarter of the taps.
         kernel = 2.0 * init(rngs.params(), (4, 4, inputs, outputs), jnp.float32)
@@ -110,7 +118,10 @@ class Up(nnx.Module):
         """Features of twice the size."""
         kernel = upsampling_kernel(self.kernel[...].astype(x.dtype))
         x = jax.lax.conv_general_dilated(
-            x, kernel, (1, 1), ((1, 1), (1, 1)),
+            x,
+            kernel,
+            (1, 1),
+            ((1, 1), (1, 1)),
             dimension_numbers=("NHWC", "HWIO", "NHWC"),
         )
         x = depth_to_space(x)

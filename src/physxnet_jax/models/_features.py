@@ -39,7 +39,7 @@ def clip_features(
     weights: Float[Array, "texels joints"],
     rotations: Float[Array, "padded joints 3 3"],
     translations: Float[Array, "padded joints 3"],
-    fps: float | Float[Array, ""],
+    fps: float,
     family: Family,
 ) -> Float[Array, "frames texels channels"]:
     """Features of successive frames, each point skinned once.

@@ -1,5 +1,6 @@
 """The generator (one encoder, a decoder a template) and the PatchGAN discriminator."""
 
+import itertools
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -62,9 +63,7 @@ class Generator(nnx.Module):
         self, channels: int, templates: Sequence[str], *, width: int = 32, rngs: nnx.Rngs
     ) -> None:
         sizes = [channels, *(width * 2**k for k in range(LEVELS))]
-        self.encoder = nnx.List(
-            [Down(a, b, rngs=rngs) for a, b in zip(sizes, sizes[1:], strict=False)]
-        )
+        self.encoder = nnx.List([Down(a, b, rngs=rngs) for a, b in itertools.pairwise(sizes)])
         self.decoders = nnx.Dict({t: Decoder(width, rngs=rngs) for t in templates})
 
     def __call__(

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 from ..body import Body
 from ..garment import Garment
 from ..geometry import polar_rotation
+from ..typing import pytree
 from ..uv import Atlas, Binding, dress_body
 from ._features import WINDOW, Family, clip_features, num_channels, skin_points
 from ._networks import Generator
@@ -38,7 +39,7 @@ class ModelConfig:
     dtype: str = "float32"
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Normalisation:
     """Scales that bring each kind of map to [-1, 1], from the training set.
@@ -54,7 +55,7 @@ class Normalisation:
     offset: dict[str, Float[Array, ""]]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Surface:
     """The texels of an atlas on a body shape.
@@ -92,7 +93,7 @@ def make_surface(
     )
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Predictor:
     """A trained network with all it needs to answer.
@@ -137,7 +138,11 @@ class Predictor:
             Offsets of covered texels; zero where the template doesn't reach.
         """
         features = clip_features(
-            self.surface.rest, self.surface.weights, rotations, translations, fps,
+            self.surface.rest,
+            self.surface.weights,
+            rotations,
+            translations,
+            fps,
             self.config.family,
         )
         features = normalise(features, self.normalisation, self.config.family)
@@ -178,12 +183,14 @@ def normalise(
 def make_generator(config: ModelConfig, *, seed: int = 0) -> Generator:
     """A generator with fresh parameters."""
     return Generator(
-        num_channels(config.family), config.templates, width=config.width,
+        num_channels(config.family),
+        config.templates,
+        width=config.width,
         rngs=nnx.Rngs(seed),
     )
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Wearable:
     """A garment bound to an atlas, on a body shape: all that dressing needs.
@@ -258,9 +265,7 @@ def apply_offsets(
     """
     sampled = wearable.binding.sample(offsets)
     if family == "paper":
-        points, _ = skin_points(
-            wearable.anchor, wearable.anchor_weights, rotations, translations
-        )
+        points, _ = skin_points(wearable.anchor, wearable.anchor_weights, rotations, translations)
         return points + sampled
     points, blend = skin_points(wearable.rest, wearable.skin, rotations, translations)
     turned = jnp.einsum("vab,vb->va", polar_rotation(blend), sampled, precision=_EXACT)
@@ -289,7 +294,7 @@ def dress_frames(
     """
     templates = tuple(dict.fromkeys(w.template for w in wearables))
     offsets = predictor(rotations, translations, fps, templates)
-    family = predictor.config.family
+    family: Family = predictor.config.family
     last = slice(WINDOW - 1, None)
     return tuple(
         jax.vmap(lambda r, t, o, w=w: apply_offsets(w, r, t, o, family))(

@@ -49,9 +49,7 @@ def find_skeleton(path: pathlib.Path) -> pathlib.Path:
     )
 
 
-def read_amc(
-    path: str | pathlib.Path, skeleton: str | pathlib.Path | None = None
-) -> SourceClip:
+def read_amc(path: str | pathlib.Path, skeleton: str | pathlib.Path | None = None) -> SourceClip:
     """An AMC file with its ASF skeleton, before retargeting.
 
     Args:
@@ -82,8 +80,10 @@ def read_amc(
         for child in links.get(parent, []):
             if child in names or child not in bones:
                 raise MotionError.at(
-                    asf or find_skeleton(path), None,
-                    f"bone '{child}' is unknown or in a cycle", "Repair :hierarchy",
+                    asf or find_skeleton(path),
+                    None,
+                    f"bone '{child}' is unknown or in a cycle",
+                    "Repair :hierarchy",
                 )
             names.append(child)
             parents.append(names.index(parent))
@@ -199,17 +199,22 @@ def _read_frames(
         name = words[0].lower()
         if frame == 0:
             raise MotionError.at(
-                path, n, f"'{words[0][:40]}' before the first frame number",
+                path,
+                n,
+                f"'{words[0][:40]}' before the first frame number",
                 "Is this an AMC file?",
             )
         if name not in bones or name not in rows:
             raise MotionError.at(
-                path, n, f"unknown bone '{words[0][:40]}'",
+                path,
+                n,
+                f"unknown bone '{words[0][:40]}'",
                 "The skeleton belongs to another file: name the right ASF",
             )
         if len(words) - 1 != len(bones[name].dof):
             raise MotionError.at(
-                path, n,
+                path,
+                n,
                 f"{len(words) - 1} values for '{name}', the skeleton has"
                 f" {len(bones[name].dof)} channels",
                 "The line is damaged, or the ASF is another subject's",
@@ -230,6 +235,8 @@ def _check_complete(
     for name, values in rows.items():
         if len(values) != frame and (values or name == "root"):
             raise MotionError.at(
-                path, n, f"frame {frame} lacks '{name}'",
+                path,
+                n,
+                f"frame {frame} lacks '{name}'",
                 "The file is truncated or damaged there: cut that frame off",
             )

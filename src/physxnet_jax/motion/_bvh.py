@@ -53,9 +53,7 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
             if c in _SLOTS and j == 0:
                 root[:, _SLOTS[c]] = block[:, k]
         world[:, j] = local if parents[j] < 0 else world[:, parents[j]] @ local
-    return SourceClip(
-        tuple(names), tuple(parents), offsets, world, root, fps, path.stem, str(path)
-    )
+    return SourceClip(tuple(names), tuple(parents), offsets, world, root, fps, path.stem, str(path))
 
 
 def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
@@ -67,7 +65,9 @@ def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
     pending = end_site = False
     if lines[0].strip().upper() != "HIERARCHY":
         raise MotionError.at(
-            path, 1, f"'{lines[0].strip()[:40]}' where HIERARCHY was expected",
+            path,
+            1,
+            f"'{lines[0].strip()[:40]}' where HIERARCHY was expected",
             "Is this a BVH file?",
         )
     for n, line in enumerate(lines[1:], start=2):
@@ -110,9 +110,7 @@ def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
             _add_channels(path, n, words, stack, channels)
         elif key == "MOTION":
             if stack:
-                raise MotionError.at(
-                    path, n, f"MOTION with {len(stack)} open braces", "Close them"
-                )
+                raise MotionError.at(path, n, f"MOTION with {len(stack)} open braces", "Close them")
             if not names:
                 raise MotionError.at(path, n, "no ROOT before MOTION", "Export again")
             for name, offset in zip(names, offsets, strict=True):
@@ -150,7 +148,9 @@ def _add_channels(
     unknown = [c for c in names if c not in _AXES and c not in _SLOTS]
     if unknown or len(set(names)) != len(names):
         raise MotionError.at(
-            path, n, f"unknown or repeated channel {unknown or names}",
+            path,
+            n,
+            f"unknown or repeated channel {unknown or names}",
             "Channels are Xposition … Zrotation, each once",
         )
     channels[stack[-1]] = names
@@ -167,7 +167,9 @@ def _read_motion(
     count = body[0][1].split(":")[1].split()
     if len(count) != 1 or not count[0].isdigit() or int(count[0]) == 0:
         raise MotionError.at(
-            path, body[0][0], f"'{body[0][1].strip()[:60]}' is not a number of frames",
+            path,
+            body[0][0],
+            f"'{body[0][1].strip()[:60]}' is not a number of frames",
             "Write the number of motion lines",
         )
     if not body[1][1].strip().startswith("Frame Time:"):

@@ -50,8 +50,7 @@ def load_motion(
         clip = procedural_clip(str(motion), fps=fps or 30.0)
     else:
         raise MotionError(
-            f"{motion}: neither a .bvh, .amc or .npz file nor a built-in clip"
-            f" ({', '.join(CLIPS)})."
+            f"{motion}: neither a .bvh, .amc or .npz file nor a built-in clip ({', '.join(CLIPS)})."
         )
     if source_fps is not None:
         clip = make_motion(clip.rotations, clip.root, source_fps, name=clip.name)
@@ -75,13 +74,13 @@ def save_motion(path: str | pathlib.Path, motion: Motion) -> None:
 def _load_npz(path: pathlib.Path) -> Motion:
     try:
         with np.load(path, allow_pickle=False) as data:
-            return make_motion(
-                data["rotations"], data["root"], float(data["fps"]), name=path.stem
-            )
+            return make_motion(data["rotations"], data["root"], float(data["fps"]), name=path.stem)
     except MotionError:
         raise
     except Exception as error:
         raise MotionError.at(
-            path, None, f"not a motion archive ({error})",
+            path,
+            None,
+            f"not a motion archive ({error})",
             "It needs arrays rotations [frames, joints, 4], root [frames, 3] and fps",
         ) from error

@@ -9,12 +9,13 @@ from jaxtyping import Array, Float
 
 from ..body import NUM_BODY_VERTICES, Body, linear_blend_skinning
 from ..errors import MotionError
+from ..typing import pytree
 
 # Frames compiled together: clips of any length are cut into blocks of this many.
 _BLOCK = 32
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Motion:
     """A clip of body motion.
@@ -37,9 +38,7 @@ class Motion:
         return self.root.shape[0]
 
 
-def make_motion(
-    rotations: object, root: object, fps: float, *, name: str = "motion"
-) -> Motion:
+def make_motion(rotations: object, root: object, fps: float, *, name: str = "motion") -> Motion:
     """A `Motion` from host arrays, checked and normalised.
 
     Args:
@@ -65,9 +64,7 @@ def make_motion(
     bad_root = ~np.isfinite(p).all(axis=1)
     if bad.any() or bad_root.any():
         frame, joint = (
-            (int(x) for x in np.argwhere(bad)[0])
-            if bad.any()
-            else (int(np.argmax(bad_root)), 0)
+            (int(x) for x in np.argwhere(bad)[0]) if bad.any() else (int(np.argmax(bad_root)), 0)
         )
         raise MotionError(
             f"{name}: frame {frame}, joint {joint} is not finite. Cut the frame out or"

@@ -51,9 +51,7 @@ def _walk(t: Time) -> tuple[Turns, Time]:
         **_pair(_about(_X, knee[0]), _about(_X, knee[1]), "Leg"),
         **_pair(_about(_X, 0.1 * stride), _about(_X, 0.1 * other), "Foot"),
         **_pair(_about(-_X, 0.45 * other), _about(-_X, 0.45 * stride), "Arm"),
-        **_pair(
-            _about(-_X, 0.35 + 0.2 * other), _about(-_X, 0.35 + 0.2 * stride), "ForeArm"
-        ),
+        **_pair(_about(-_X, 0.35 + 0.2 * other), _about(-_X, 0.35 + 0.2 * stride), "ForeArm"),
         "Spine": _about(_Y, -0.08 * stride),
         "Hips": _about(_Y, 0.08 * stride),
     }
@@ -222,14 +220,10 @@ def procedural_clip(
         up = aligned[parent].inv() if parent >= 0 else Rotation.identity()
         local[:, j] = (up * turn * aligned[j]).as_quat(scalar_first=True)
     motion = make_motion(local, np.zeros((len(t), 3)), fps, name=name)
-    return make_motion(
-        local, _planted_root(body, motion, air), fps, name=name
-    )
+    return make_motion(local, _planted_root(body, motion, air), fps, name=name)
 
 
-def _planted_root(
-    body: Body, motion: Motion, air: Time
-) -> Float[np.ndarray, "frames 3"]:
+def _planted_root(body: Body, motion: Motion, air: Time) -> Float[np.ndarray, "frames 3"]:
     """Hips positions that keep the lower foot in place and the feet at height air."""
     rest = body.rest_vertices(body.default_shape())
     ankles = [body.joint("LeftFoot"), body.joint("RightFoot")]
@@ -239,9 +233,7 @@ def _planted_root(
     left, right = feet[:, 0], feet[:, 1]
     # A soft choice of the standing foot: a hard one would jerk the hips.
     share = 1.0 / (1.0 + np.exp((left[:, 1] - right[:, 1]) / 0.01))
-    step = share[1:, None] * np.diff(left, axis=0) + (1 - share[1:, None]) * np.diff(
-        right, axis=0
-    )
+    step = share[1:, None] * np.diff(left, axis=0) + (1 - share[1:, None]) * np.diff(right, axis=0)
     root = np.zeros((len(left), 3))
     root[1:] = -np.cumsum(step, axis=0)
     root[:, 1] = air - foot_heights(body, motion, rest)

@@ -123,7 +123,9 @@ def retarget(
     for b, s in joints.items():
         if s not in source.names:
             raise MotionError.at(
-                source.path, None, f"the skeleton has no joint '{s}' (for {b})",
+                source.path,
+                None,
+                f"the skeleton has no joint '{s}' (for {b})",
                 f"It has: {', '.join(source.names[:40])}",
             )
         index[b] = source.names.index(s)
@@ -180,9 +182,7 @@ def foot_heights(
 ) -> Float[np.ndarray, " frames"]:
     """Height of the lowest vertex of both feet in each frame [m]."""
     rows = np.flatnonzero(_foot_vertices(body))
-    moved = animate(
-        body, rest, rest[jnp.asarray(rows)], body.weights[jnp.asarray(rows)], motion
-    )
+    moved = animate(body, rest, rest[jnp.asarray(rows)], body.weights[jnp.asarray(rows)], motion)
     return np.asarray(moved)[:, :, 1].min(axis=1)
 
 
@@ -203,9 +203,7 @@ def _reference(
     if upright and len(source.root) > 1:
         pointing = _limb_directions(source, index, first)
         sideways = [
-            (1.0 if k.startswith("Left") else -1.0) * pointing[k][0]
-            for k in limbs
-            if "Arm" in k
+            (1.0 if k.startswith("Left") else -1.0) * pointing[k][0] for k in limbs if "Arm" in k
         ]
         down = [-pointing[k][1] for k in limbs if "Leg" in k]
         if min(sideways + down) > _T_POSE:

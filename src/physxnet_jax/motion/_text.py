@@ -17,9 +17,7 @@ def read_lines(path: pathlib.Path, kind: str) -> list[str]:
     if not path.is_file():
         raise MotionError.at(path, None, "no such file", "Check the path")
     if path.stat().st_size > _MAX_BYTES:
-        raise MotionError.at(
-            path, None, "over 500 MB of text", "Cut the clip into shorter files"
-        )
+        raise MotionError.at(path, None, "over 500 MB of text", "Cut the clip into shorter files")
     blob = path.read_bytes()
     if not blob.strip():
         raise MotionError.at(path, None, "the file is empty", f"Export the {kind} again")

@@ -29,9 +29,7 @@ def clip_transforms(
 
 @jax.jit
 def _transforms(body: Body, rest: Array, q: Array, p: Array) -> tuple[Array, Array]:
-    return jax.vmap(lambda a, b: body.transforms(rest, a, b))(
-        jnp.asarray(q), jnp.asarray(p)
-    )
+    return jax.vmap(lambda a, b: body.transforms(rest, a, b))(jnp.asarray(q), jnp.asarray(p))
 
 
 def padded_block(values: np.ndarray, start: int, before: int) -> np.ndarray:

@@ -46,9 +46,7 @@ class Assembly:
     parts: tuple[int, ...]
 
 
-def assemble(
-    garments: tuple[Garment, ...], body: Body, shape: Float[Array, " shapes"]
-) -> Assembly:
+def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " shapes"]) -> Assembly:
     """Garments at rest on a body, as one system."""
     rest_body = body.rest_vertices(shape)
     rest, faces, mass, pinned, weights = [], [], [], [], []
@@ -79,10 +77,19 @@ def assemble(
         parts.append(parts[-1] + len(x))
     cat = np.concatenate
     return Assembly(
-        body, np.asarray(rest_body, np.float64), cat(rest), cat(faces), cat(mass),
-        cat(pinned), cat(weights), cat(per_vertex["thickness"]),
-        cat(per_vertex["friction"]), cat(per_face["stretch"]), cat(per_face["bend"]),
-        cat(loose), tuple(parts),
+        body,
+        np.asarray(rest_body, np.float64),
+        cat(rest),
+        cat(faces),
+        cat(mass),
+        cat(pinned),
+        cat(weights),
+        cat(per_vertex["thickness"]),
+        cat(per_vertex["friction"]),
+        cat(per_face["stretch"]),
+        cat(per_face["bend"]),
+        cat(loose),
+        tuple(parts),
     )
 
 

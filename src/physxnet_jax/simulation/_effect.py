@@ -3,13 +3,13 @@
 import dataclasses
 from typing import Any
 
-import jax
 from jaxtyping import Array, Float
 
+from ..typing import pytree
 from ._assembly import Assembly
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Attached:
     """Points that an effect needs skinned with the body.
@@ -25,7 +25,7 @@ class Attached:
     weights: Float[Array, "points joints"]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Placed:
     """Attached points at one moment.
@@ -59,9 +59,7 @@ class Prepared:
         """Velocities [m/s] after external forces have acted for ``h`` [s]."""
         return velocity
 
-    def begin(
-        self, base: Float[Array, "vertices 3 batch"], start: Any, end: Any
-    ) -> Any:
+    def begin(self, base: Float[Array, "vertices 3 batch"], start: Any, end: Any) -> Any:
         """What `project` needs for a block (a pytree; None for nothing).
 
         Args:

@@ -41,9 +41,7 @@ class Rollout:
         return self.diagnostics["finite"].astype(bool)
 
 
-def lead_in(
-    body: Body, motion: Motion, *, seconds: float = 1.5, settle: float = 0.4
-) -> Motion:
+def lead_in(body: Body, motion: Motion, *, seconds: float = 1.5, settle: float = 0.4) -> Motion:
     """Frames that lead from the rest pose smoothly into a clip's first frame.
 
     The body stands at the clip's place with its heading, holds the rest pose while the
@@ -73,9 +71,7 @@ def lead_in(
         pair = Rotation.from_quat(np.stack([rest[j], first[j]]), scalar_first=True)
         rotations[:, j] = Slerp([0.0, 1.0], pair)(s).as_quat(scalar_first=True)
     root = np.repeat(np.asarray(motion.root[:1]), frames, axis=0)
-    return Motion(
-        float32(rotations), jnp.asarray(root), motion.fps, f"{motion.name} lead-in"
-    )
+    return Motion(float32(rotations), jnp.asarray(root), motion.fps, f"{motion.name} lead-in")
 
 
 def simulate(
@@ -102,9 +98,7 @@ def simulate(
     Raises:
         SimulationError: A frame that isn't finite (its number is named).
     """
-    results = simulate_batch(
-        prepare_scene(scene), [motion], solver=solver, progress=progress
-    )
+    results = simulate_batch(prepare_scene(scene), [motion], solver=solver, progress=progress)
     out = results[0]
     if throw and not out.finite.all():
         frame = int(np.argmin(out.finite))
@@ -158,7 +152,10 @@ def simulate_batch(
     rotations, root = stack("rotations"), stack("root")
     start = [
         animate(
-            body, rest, float32(scene.assembly.rest), float32(scene.assembly.weights),
+            body,
+            rest,
+            float32(scene.assembly.rest),
+            float32(scene.assembly.weights),
             Motion(lead.rotations[:1], lead.root[:1], fps),
         )[0]
         for lead in leads
@@ -169,8 +166,14 @@ def simulate_batch(
     for at in range(0, total - 1, _BLOCK):
         part = slice(at, at + _BLOCK + 1)
         state, moved, info = advance(
-            body, rest, scene.effects, state, jnp.asarray(rotations[part]),
-            jnp.asarray(root[part]), solver=solver, fps=fps,
+            body,
+            rest,
+            scene.effects,
+            state,
+            jnp.asarray(rotations[part]),
+            jnp.asarray(root[part]),
+            solver=solver,
+            fps=fps,
         )
         positions.append(np.asarray(moved))
         diagnostics.append({k: np.asarray(v) for k, v in info.items()})

@@ -14,7 +14,12 @@ from ._effect import Effect, Prepared
 from .effects import Bend, BodyContact, Damping, Gravity, Pin, Stretch
 
 STANDARD: tuple[Effect, ...] = (
-    Gravity(), Damping(), Stretch(), Bend(), BodyContact(), Pin(),
+    Gravity(),
+    Damping(),
+    Stretch(),
+    Bend(),
+    BodyContact(),
+    Pin(),
 )
 """What clothes on a moving person call for, in the order they are applied."""
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..body import Body, blend_rotations
+from ..typing import pytree
 from ._effect import Attached, Placed, Prepared
 
 
@@ -30,7 +31,7 @@ class XPBD:
             )
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class State:
     """Cloth in motion.
@@ -103,22 +104,15 @@ def advance(
 
     def skin(q: Array, p: Array) -> tuple[Placed | None, ...]:
         return tuple(
-            None if e.attached is None else place(body, rest, e.attached, q, p)
-            for e in effects
+            None if e.attached is None else place(body, rest, e.attached, q, p) for e in effects
         )
 
     def block(carry: tuple, k: Array) -> tuple[tuple, None]:
         state, _, _, before, after = carry
-        start = jax.tree.map(
-            lambda a, b: a + (k / solver.queries) * (b - a), before, after
-        )
-        end = jax.tree.map(
-            lambda a, b: a + ((k + 1) / solver.queries) * (b - a), before, after
-        )
+        start = jax.tree.map(lambda a, b: a + (k / solver.queries) * (b - a), before, after)
+        end = jax.tree.map(lambda a, b: a + ((k + 1) / solver.queries) * (b - a), before, after)
         base = state.position
-        contexts = tuple(
-            e.begin(base, s, t) for e, s, t in zip(effects, start, end, strict=True)
-        )
+        contexts = tuple(e.begin(base, s, t) for e, s, t in zip(effects, start, end, strict=True))
 
         def substep(i: Array, moving: tuple[Array, Array]) -> tuple[Array, Array]:
             d, v = moving
@@ -131,9 +125,7 @@ def advance(
                 x = e.project(x, d, context, progress, (h, share))
             return x, v + (x - predicted) / h
 
-        d, v = jax.lax.fori_loop(
-            0, per_block, substep, (jnp.zeros_like(base), state.velocity)
-        )
+        d, v = jax.lax.fori_loop(0, per_block, substep, (jnp.zeros_like(base), state.velocity))
         return (State(base + d, v), d, contexts, before, after), None
 
     def frame(carry: tuple, pose: tuple[Array, Array]) -> tuple[tuple, tuple]:

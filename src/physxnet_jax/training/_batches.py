@@ -13,7 +13,6 @@ from ..data import Sequence
 from ..errors import FormatError
 from ..garment import Garment
 from ..geometry import polar_rotation
-from ..motion import clip_transforms
 from ..models import (
     Family,
     Normalisation,
@@ -22,6 +21,7 @@ from ..models import (
     pose_windows,
     skin_points,
 )
+from ..motion import clip_transforms
 from ..uv import Transference
 
 # Offsets are kept as whole tenths of a millimetre, as on disk.
@@ -91,9 +91,7 @@ def load_frames(
             have = name in s.offsets and usable_garment(s.meta[name])
             usable[name].append(np.full(len(world), have))
             if not have:
-                targets[name].append(
-                    np.zeros((len(world), g.num_vertices, 3), dtype=np.int16)
-                )
+                targets[name].append(np.zeros((len(world), g.num_vertices, 3), dtype=np.int16))
                 continue
             offset = s.offsets[name]
             if family == "local":
@@ -101,8 +99,11 @@ def load_frames(
             targets[name].append(np.round(offset / _QUANTUM).astype(np.int16))
     cat = np.concatenate
     return Frames(
-        cat(rotations), cat(translations), {t: cat(v) for t, v in targets.items()},
-        {t: cat(v) for t, v in usable.items()}, rates.pop(),
+        cat(rotations),
+        cat(translations),
+        {t: cat(v) for t, v in targets.items()},
+        {t: cat(v) for t, v in usable.items()},
+        rates.pop(),
     )
 
 
@@ -112,7 +113,9 @@ def _to_local(
     frames = len(world)
     pick = np.minimum(np.arange(-(-frames // _CHUNK) * _CHUNK), frames - 1)
     out = [
-        np.asarray(_rotate_back(garment.skin, world[pick[i : i + _CHUNK]], offset[pick[i : i + _CHUNK]]))
+        np.asarray(
+            _rotate_back(garment.skin, world[pick[i : i + _CHUNK]], offset[pick[i : i + _CHUNK]])
+        )
         for i in range(0, len(pick), _CHUNK)
     ]
     return np.concatenate(out)[:frames]
@@ -200,8 +203,12 @@ def measure_normalisation(
     rows = [
         np.abs(
             look(
-                surface.rest, surface.weights, frames.rotations[i],
-                frames.translations[i], frames.fps, family="paper",
+                surface.rest,
+                surface.weights,
+                frames.rotations[i],
+                frames.translations[i],
+                frames.fps,
+                family="paper",
             )[0]
         )
         for i in pick

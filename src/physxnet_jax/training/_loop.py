@@ -3,8 +3,7 @@
 import json
 import pathlib
 import time
-from collections.abc import Callable
-from collections.abc import Sequence as Items
+from collections.abc import Callable, Sequence as Items
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +16,14 @@ from ..errors import PhysXNetError
 from ..garment import template
 from ..models import ModelConfig, Normalisation, Predictor, Surface, make_surface
 from ..uv import Atlas, garment_map_rows, make_atlas
-from ._batches import Frames, batch_indices, load_frames, measure_normalisation, take, target_offsets
+from ._batches import (
+    Frames,
+    batch_indices,
+    load_frames,
+    measure_normalisation,
+    take,
+    target_offsets,
+)
 from ._checkpoint import Checkpoints, config_json
 from ._config import TrainConfig
 from ._step import ClothTables, TrainState, make_step
@@ -79,9 +85,7 @@ def train(
     per_epoch = max(len(frames) // config.batch, 1)
     total = per_epoch * config.epochs
     stop = total if steps is None else min(steps, total)
-    state, step, graph = make_step(
-        config, atlas, surface, normalisation, tables, frames.fps, total
-    )
+    state, step, graph = make_step(config, atlas, surface, normalisation, tables, frames.fps, total)
     (folder / "config.json").write_text(config_json(config))
     checkpoints = Checkpoints(folder / "checkpoints")
     restored = checkpoints.latest(state)
@@ -143,9 +147,15 @@ def _normalisation(
             continue
         pick = rng.choice(good, min(32, len(good)), replace=False)
         meters = target_offsets(
-            jnp.asarray(frames.targets[t][pick]), c.to_cloth, c.rest, c.skin, c.anchor,
-            c.anchor_weights, jnp.asarray(frames.rotations[pick, -1]),
-            jnp.asarray(frames.translations[pick, -1]), config.model.family,
+            jnp.asarray(frames.targets[t][pick]),
+            c.to_cloth,
+            c.rest,
+            c.skin,
+            c.anchor,
+            c.anchor_weights,
+            jnp.asarray(frames.rotations[pick, -1]),
+            jnp.asarray(frames.translations[pick, -1]),
+            config.model.family,
         )
         offsets[t] = meters[:, np.asarray(surface.valid[t])]
     return measure_normalisation(frames, surface, offsets, seed=config.seed)

@@ -19,13 +19,14 @@ from ..models import (
     normalise,
     num_channels,
 )
+from ..typing import pytree
 from ..uv import Atlas, Transference
 from ._batches import target_offsets
 from ._config import TrainConfig
 from ._losses import adversarial_loss, discriminator_loss, masked_l1, soft_labels
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class TrainState:
     """All that changes from step to step; saved whole.
@@ -49,7 +50,7 @@ class TrainState:
     step: Array
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class ClothTables:
     """What turns a template's stored offsets into texel targets.
@@ -90,7 +91,9 @@ def make_step(
 ) -> tuple[TrainState, Callable[[TrainState, dict, Key[Array, ""]], tuple[TrainState, dict]], Any]:
     """The first state, the step function and the generator's graph."""
     family, templates = config.model.family, config.model.templates
-    g_graph, g_params, g_rest = nnx.split(make_generator(config.model, seed=config.seed), nnx.Param, ...)
+    g_graph, g_params, g_rest = nnx.split(
+        make_generator(config.model, seed=config.seed), nnx.Param, ...
+    )
     judge = Discriminator(
         num_channels(family) + 3 * len(templates),
         width=config.discriminator_width,
@@ -100,7 +103,12 @@ def make_step(
     g_tx = make_optimiser(config, config.learning_rate, steps)
     d_tx = make_optimiser(config, config.discriminator_rate, steps)
     state = TrainState(
-        g_params, g_rest, d_params, d_rest, g_tx.init(g_params), d_tx.init(d_params),
+        g_params,
+        g_rest,
+        d_params,
+        d_rest,
+        g_tx.init(g_params),
+        d_tx.init(d_params),
         jnp.zeros((), jnp.int32),
     )
     dtype = jnp.dtype(config.model.dtype)
@@ -109,7 +117,9 @@ def make_step(
         network = nnx.merge(g_graph, params, rest, copy=True)
         network.train()
         out = network(x.astype(dtype), templates)
-        return {t: m.astype(jnp.float32) for t, m in out.items()}, nnx.state(network, nnx.Not(nnx.Param))
+        return {t: m.astype(jnp.float32) for t, m in out.items()}, nnx.state(
+            network, nnx.Not(nnx.Param)
+        )
 
     def judge_maps(params: Any, rest: Any, x: Array, y: Array) -> tuple[Array, Any]:
         network = nnx.merge(d_graph, params, rest, copy=True)
@@ -120,9 +130,15 @@ def make_step(
         return jnp.concatenate([maps[t] * masks[t] for t in templates], axis=-1)
 
     @jax.jit
-    def step(state: TrainState, batch: dict[str, Array], key: Key[Array, ""]) -> tuple[TrainState, dict]:
+    def step(
+        state: TrainState, batch: dict[str, Array], key: Key[Array, ""]
+    ) -> tuple[TrainState, dict]:
         features = jax.vmap(clip_features, in_axes=(None, None, 0, 0, None, None))(
-            surface.rest, surface.weights, batch["rotations"], batch["translations"], fps,
+            surface.rest,
+            surface.weights,
+            batch["rotations"],
+            batch["translations"],
+            fps,
             family,
         )
         x = atlas.to_map(normalise(features[:, 0], normalisation, family))
@@ -130,8 +146,14 @@ def make_step(
         for t in templates:
             c = tables[t]
             meters = target_offsets(
-                batch[f"target_{t}"], c.to_cloth, c.rest, c.skin, c.anchor,
-                c.anchor_weights, batch["rotations"][:, -1], batch["translations"][:, -1],
+                batch[f"target_{t}"],
+                c.to_cloth,
+                c.rest,
+                c.skin,
+                c.anchor,
+                c.anchor_weights,
+                batch["rotations"][:, -1],
+                batch["translations"][:, -1],
                 family,
             )
             targets[t] = meters / normalisation.offset[t]
@@ -162,11 +184,17 @@ def make_step(
         updates, g_opt = g_tx.update(grads, state.generator_opt, state.generator)
         g_params = optax.apply_updates(state.generator, updates)
         ok = jnp.isfinite(loss)
-        g_rest = jax.tree.map(lambda new, old: jnp.where(ok, new, old), g_rest, state.generator_rest)
+        g_rest = jax.tree.map(
+            lambda new, old: jnp.where(ok, new, old), g_rest, state.generator_rest
+        )
         metrics = {"loss": loss, "l1": l1, "adversarial": adv}
         metrics |= {f"l1_mm_{t}": 1e3 * parts[t] * normalisation.offset[t] for t in templates}
-        metrics["skipped"] = g_opt.total_notfinite
-        d_params, d_rest, d_opt = state.discriminator, state.discriminator_rest, state.discriminator_opt
+        metrics["skipped"] = g_opt.total_notfinite  # pyright: ignore[reportAttributeAccessIssue]
+        d_params, d_rest, d_opt = (
+            state.discriminator,
+            state.discriminator_rest,
+            state.discriminator_opt,
+        )
         if config.adversarial:
             still = jax.lax.stop_gradient(fake)
 
@@ -175,7 +203,8 @@ def make_step(
                 fake_logits, rest = judge_maps(params, rest, x, still)
                 k_real, k_fake = jax.random.split(key)
                 value = discriminator_loss(
-                    real_logits, fake_logits,
+                    real_logits,
+                    fake_logits,
                     soft_labels(k_real, real_logits.shape, real=True),
                     soft_labels(k_fake, fake_logits.shape, real=False),
                 )
@@ -184,9 +213,9 @@ def make_step(
                 )
                 return value, (rest, 0.5 * right)
 
-            (d_loss, (d_rest, accuracy)), d_grads = jax.value_and_grad(
-                judge_loss, has_aux=True
-            )(state.discriminator)
+            (d_loss, (d_rest, accuracy)), d_grads = jax.value_and_grad(judge_loss, has_aux=True)(
+                state.discriminator
+            )
             d_updates, d_opt = d_tx.update(d_grads, state.discriminator_opt, state.discriminator)
             d_params = optax.apply_updates(state.discriminator, d_updates)
             fine = jnp.isfinite(d_loss)

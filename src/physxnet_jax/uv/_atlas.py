@@ -4,13 +4,13 @@ import dataclasses
 import functools
 import hashlib
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..geometry import connected_components
+from ..typing import pytree
 from ._rasterise import rasterise
 from ._transference import Transference
 
@@ -25,7 +25,7 @@ _LEFT_OUT = (
 _SMOOTH = 0.05
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Atlas:
     """Texels of the clothed part of the body.
@@ -92,9 +92,7 @@ class Atlas:
         return h.hexdigest()[:16]
 
 
-def make_atlas(
-    resolution: int | tuple[int, int] = 256, body: Body | None = None
-) -> Atlas:
+def make_atlas(resolution: int | tuple[int, int] = 256, body: Body | None = None) -> Atlas:
     """The atlas of a size.
 
     The torso and limbs chart is cropped to its bounding box and stretched row by row
@@ -164,9 +162,7 @@ def _stretch(
     out = (uv - low) / (high - low)
     levels = np.linspace(0.0, 1.0, 201)
     x, y = np.abs(out[used, 0] - 0.5), out[used, 1]
-    reach = np.asarray(
-        [x[np.abs(y - v) <= _SMOOTH].max(initial=0.05) for v in levels]
-    )
+    reach = np.asarray([x[np.abs(y - v) <= _SMOOTH].max(initial=0.05) for v in levels])
     # The running maximum keeps everything inside; the mean keeps the map smooth.
     kernel = np.ones(2 * int(_SMOOTH * 200 / 2) + 1)
     kernel /= kernel.sum()

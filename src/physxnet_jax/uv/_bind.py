@@ -2,15 +2,15 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body
 from ..garment import Garment, Template
 from ..geometry import TriMesh, cast_rays, closest_points, vertex_normals
+from ..typing import pytree
 from ._atlas import Atlas
 from ._dress_body import dress_body
 from ._transference import Transference
@@ -21,7 +21,7 @@ _REACH: dict[Template, float] = {"top": 0.08, "bottom": 0.08, "dress": 0.30}
 _STRAY = 2.0
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Binding:
     """A garment tied to an atlas.
@@ -136,7 +136,9 @@ def bind(
     face = jnp.where(good, hits.face, near.face)
     weights = jnp.where(good[:, None], hits.weights, near.weights)
     uv = np.einsum(
-        "vk,vkc->vc", np.asarray(weights), np.asarray(mesh.uv)[np.asarray(mesh.uv_faces)[np.asarray(face)]]
+        "vk,vkc->vc",
+        np.asarray(weights),
+        np.asarray(mesh.uv)[np.asarray(mesh.uv_faces)[np.asarray(face)]],
     )
     texel, weight, off = sampling_weights(atlas, uv, np.asarray(valid), mesh, face, weights)
     return Binding(
@@ -174,7 +176,9 @@ def sampling_weights(
     fx, fy = x - x0, y - y0
     places = np.asarray(atlas.to_body @ mesh.vertices)
     here = np.einsum(
-        "vk,vkc->vc", np.asarray(weights), np.asarray(mesh.vertices)[np.asarray(mesh.faces)[np.asarray(face)]]
+        "vk,vkc->vc",
+        np.asarray(weights),
+        np.asarray(mesh.vertices)[np.asarray(mesh.faces)[np.asarray(face)]],
     )
     texel = np.zeros((len(uv), 4), dtype=np.int32)
     weight = np.zeros((len(uv), 4))
@@ -183,7 +187,13 @@ def sampling_weights(
     for k, (dx, dy) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
         cx, cy = x0 + dx, y0 + dy
         inside = (cx >= 0) & (cx < atlas.width) & (cy >= 0) & (cy < atlas.height)
-        row = np.where(inside, row_of[np.clip(cy, 0, atlas.height - 1) * atlas.width + np.clip(cx, 0, atlas.width - 1)], -1)
+        row = np.where(
+            inside,
+            row_of[
+                np.clip(cy, 0, atlas.height - 1) * atlas.width + np.clip(cx, 0, atlas.width - 1)
+            ],
+            -1,
+        )
         ok = (row >= 0) & valid[row]
         ok &= np.linalg.norm(places[row] - here, axis=1) < limit
         w = np.where(dx, fx, 1 - fx) * np.where(dy, fy, 1 - fy)
@@ -193,7 +203,7 @@ def sampling_weights(
     lost = total < 1e-3
     if lost.any():
         rows = np.flatnonzero(valid)
-        nearest = rows[cKDTree(places[rows]).query(here[lost])[1]]
+        nearest = rows[KDTree(places[rows]).query(here[lost])[1]]
         texel[lost] = nearest[:, None]
         weight[lost] = [1.0, 0.0, 0.0, 0.0]
         total = np.where(lost, 1.0, total)

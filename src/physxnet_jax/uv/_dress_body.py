@@ -11,9 +11,7 @@ _INNER = 0.12
 _BLEND = 0.08
 
 
-def dress_body(
-    body: Body, rest: Float[np.ndarray, "all 3"]
-) -> Float[np.ndarray, "vertices 3"]:
+def dress_body(body: Body, rest: Float[np.ndarray, "all 3"]) -> Float[np.ndarray, "vertices 3"]:
     """Body vertices at rest with the legs blown up to one elliptic column.
 
     At each height the outer half of each leg becomes half of the ellipse that encloses
@@ -32,7 +30,9 @@ def dress_body(
     v = np.asarray(rest[:NUM_BODY_VERTICES], dtype=np.float64).copy()
     weights = np.asarray(body.weights)[:NUM_BODY_VERTICES]
     sides = {
-        s: weights[:, [body.joint(f"{s}{n}") for n in ("UpLeg", "Leg", "Foot", "ToeBase")]].sum(axis=1)
+        s: weights[:, [body.joint(f"{s}{n}") for n in ("UpLeg", "Leg", "Foot", "ToeBase")]].sum(
+            axis=1
+        )
         for s in ("Left", "Right")
     }
     leg = np.maximum(sides["Left"], sides["Right"])
@@ -53,7 +53,9 @@ def dress_body(
         rows = np.flatnonzero(member & (sides[side] > 0.5))
         hip, knee, foot = (heads[body.joint(f"{side}{n}")] for n in ("UpLeg", "Leg", "Foot"))
         x, y, z = v[rows].T
-        axis = [np.interp(y, [foot[1], knee[1], hip[1]], [foot[k], knee[k], hip[k]]) for k in (0, 2)]
+        axis = [
+            np.interp(y, [foot[1], knee[1], hip[1]], [foot[k], knee[k], hip[k]]) for k in (0, 2)
+        ]
         # Around the leg: 0 outwards, 90 degrees in front. The outer half of the ring
         # becomes half the ellipse; the inner half folds back beneath it.
         angle = np.arctan2(z - axis[1], sign * (x - axis[0]))

@@ -60,7 +60,11 @@ def rasterise(
     a, b, c = (xy[faces[own, k]].astype(np.float64) for k in range(3))
     area = _cross(b - a, c - a)
     weights = np.column_stack(
-        [_cross(b - points, c - points), _cross(c - points, a - points), _cross(a - points, b - points)]
+        [
+            _cross(b - points, c - points),
+            _cross(c - points, a - points),
+            _cross(a - points, b - points),
+        ]
     )
     weights = np.clip(weights / area[:, None], 0.0, 1.0)
     return texels, own, weights / weights.sum(axis=1, keepdims=True)
@@ -72,8 +76,14 @@ def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 @functools.partial(jax.jit, static_argnums=(4, 5, 6, 7))
 def _owners(
-    xy: Array, faces: Array, low: Array, index: Array,
-    height: int, width: int, size: int, nobody: int,
+    xy: Array,
+    faces: Array,
+    low: Array,
+    index: Array,
+    height: int,
+    width: int,
+    size: int,
+    nobody: int,
 ) -> Array:
     """First covering face of every texel, ``nobody`` where there is none."""
     offsets = jnp.stack(
@@ -97,9 +107,7 @@ def _owners(
         x, y = at[..., 0], at[..., 1]
         inside &= (x >= 0) & (x < width) & (y >= 0) & (y < height)
         flat = jnp.where(inside, y * width + x, height * width)
-        return owner.at[flat].min(
-            jnp.broadcast_to(ids[:, None], flat.shape), mode="drop"
-        ), None
+        return owner.at[flat].min(jnp.broadcast_to(ids[:, None], flat.shape), mode="drop"), None
 
     start = jnp.full((height * width,), nobody, jnp.int32)
     owner, _ = jax.lax.scan(block, start, (faces, low, index))

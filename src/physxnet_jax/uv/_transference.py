@@ -2,14 +2,14 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry import interpolate
+from ..typing import pytree
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class Transference:
     """A sparse row-stochastic matrix: each row mixes the three corners of a face.
@@ -45,6 +45,4 @@ class Transference:
 def identity_rows(index: Int[Array, " rows"]) -> Transference:
     """The transference that picks single vertices."""
     one = jnp.zeros((index.shape[0], 3), jnp.float32).at[:, 0].set(1.0)
-    return Transference(
-        jnp.repeat(index[:, None], 3, axis=1), one, jnp.ones(index.shape, bool)
-    )
+    return Transference(jnp.repeat(index[:, None], 3, axis=1), one, jnp.ones(index.shape, bool))

@@ -47,14 +47,21 @@ class _Stage:
             surface = pyvista.PolyData.from_regular_faces(m.positions[0].copy(), m.faces)
             self.surfaces.append(surface)
             self.plotter.add_mesh(
-                surface, color=m.colour, smooth_shading=True, specular=0.1,
+                surface,
+                color=m.colour,
+                smooth_shading=True,
+                specular=0.1,
                 backface_params={"color": tuple(0.6 * c for c in m.colour)},
             )
         path = np.concatenate([m.positions.mean(axis=1) for m in meshes[:1]])
         middle, reach = path.mean(axis=0), 2.5 + np.ptp(path, axis=0).max()
         ground = pyvista.Plane(
-            center=(middle[0], self.floor - 0.002, middle[2]), direction=(0, 1, 0),
-            i_size=2 * reach, j_size=2 * reach, i_resolution=20, j_resolution=20,
+            center=(middle[0], self.floor - 0.002, middle[2]),
+            direction=(0, 1, 0),
+            i_size=2 * reach,
+            j_size=2 * reach,
+            i_resolution=20,
+            j_resolution=20,
         )
         self.plotter.add_mesh(ground, color="#b9bec4", show_edges=True, edge_color="#a4a9b0")
 
@@ -63,8 +70,13 @@ class _Stage:
         centre = self.meshes[0].positions[frame].mean(axis=0)
         for m, surface in zip(self.meshes, self.surfaces, strict=True):
             surface.points = m.positions[frame].copy()
-            surface.compute_normals(inplace=True, cell_normals=False, split_vertices=False,
-                                    consistent_normals=False, auto_orient_normals=False)
+            surface.compute_normals(
+                inplace=True,
+                cell_normals=False,
+                split_vertices=False,
+                consistent_normals=False,
+                auto_orient_normals=False,
+            )
         target = np.array([centre[0], self.floor + 0.9, centre[2]])
         eye = target + np.array([1.3, 0.5, 3.4])
         self.plotter.camera_position = [tuple(eye), tuple(target), (0.0, 1.0, 0.0)]
@@ -135,11 +147,11 @@ def render_preview(
                 with warnings.catch_warnings():
                     # ffmpeg is started by fork and exec: nothing of JAX runs in between.
                     warnings.filterwarnings("ignore", message=".*os.fork.*")
-                    iio.imwrite(
-                        part, np.stack(shots), fps=fps, extension=".mp4", codec="libx264"
-                    )
+                    iio.imwrite(part, np.stack(shots), fps=fps, extension=".mp4", codec="libx264")
             else:
-                iio.imwrite(part, np.stack(shots), duration=1000 * stride / fps, loop=0, extension=".gif")
+                iio.imwrite(
+                    part, np.stack(shots), duration=1000 * stride / fps, loop=0, extension=".gif"
+                )
     finally:
         stage.plotter.close()
     part.replace(path)

@@ -2,12 +2,12 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...geometry import greedy_colours, hinges
+from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Effect, Prepared
 from ._coloured import scatter_rows
@@ -42,9 +42,7 @@ class Bend(Effect):
                 _Group(
                     tuple(jnp.asarray(index[:, i]) for i in range(4)),
                     tuple(float32(c[:, i])[:, None, None] for i in range(4)),
-                    tuple(
-                        float32(w[index[:, i]] * c[:, i])[:, None, None] for i in range(4)
-                    ),
+                    tuple(float32(w[index[:, i]] * c[:, i])[:, None, None] for i in range(4)),
                     float32((w[index] * c * c).sum(axis=1))[:, None, None],
                     float32(1.0 / np.maximum(k[members], 1e-12))[:, None, None],
                 )
@@ -82,7 +80,7 @@ def _hinge_stiffness(
     return of_vertex[quads[:, 0]]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class _Group:
     index: tuple[Int[Array, " members"], ...]
@@ -92,7 +90,7 @@ class _Group:
     compliance: Float[Array, "members 1 1"]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class _Bend(Prepared):
     groups: tuple[_Group, ...]

@@ -6,10 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES, Body, triangulate
 from ...geometry import closest_barycentric, vertex_normals
+from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Attached, Effect, Placed, Prepared
 
@@ -17,8 +18,22 @@ from .._effect import Attached, Effect, Placed, Prepared
 _LIMBS = {
     "LeftLeg": ("LeftUpLeg", "LeftLeg", "LeftFoot", "LeftToeBase"),
     "RightLeg": ("RightUpLeg", "RightLeg", "RightFoot", "RightToeBase"),
-    "LeftArm": ("LeftArm", "LeftForeArm", "LeftHand", "LThumb", "LeftFingerBase", "LeftHandFinger1"),
-    "RightArm": ("RightArm", "RightForeArm", "RightHand", "RThumb", "RightFingerBase", "RightHandFinger1"),
+    "LeftArm": (
+        "LeftArm",
+        "LeftForeArm",
+        "LeftHand",
+        "LThumb",
+        "LeftFingerBase",
+        "LeftHandFinger1",
+    ),
+    "RightArm": (
+        "RightArm",
+        "RightForeArm",
+        "RightHand",
+        "RThumb",
+        "RightFingerBase",
+        "RightHandFinger1",
+    ),
 }
 
 
@@ -85,10 +100,7 @@ def _limb_labels(
 ) -> Int[np.ndarray, " points"]:
     """0 for the trunk, else the limb that carries most of the weight."""
     share = np.stack(
-        [
-            weights[:, [body.joint(n) for n in names]].sum(axis=1)
-            for names in _LIMBS.values()
-        ],
+        [weights[:, [body.joint(n) for n in names]].sum(axis=1) for names in _LIMBS.values()],
         axis=1,
     )
     return np.where(share.max(axis=1) > 0.5, share.argmax(axis=1) + 1, 0)
@@ -118,19 +130,19 @@ def _patches(
             if lab in (1, 2) and not loose:
                 pool = pool[label[pool] != 3 - lab]
             k = min(count, len(pool))
-            near = cKDTree(skin[pool]).query(assembly.rest[rows], k=k)[1].reshape(-1, k)
+            near = KDTree(skin[pool]).query(assembly.rest[rows], k=k)[1].reshape(-1, k)
             out[rows] = pool[near][:, np.minimum(np.arange(count), k - 1)]
     middles = skin[faces].mean(axis=1)
     size = min(size, len(faces))
     table = np.zeros((len(skin), size), dtype=np.int32)
     used = np.unique(out)
-    table[used] = cKDTree(middles).query(skin[used], k=size)[1].reshape(-1, size)
+    table[used] = KDTree(middles).query(skin[used], k=size)[1].reshape(-1, size)
     return out, table
 
 
 def _spread(points: Float[np.ndarray, "points 3"], spacing: float) -> np.ndarray:
     """A subset of points at least a distance apart, greedily in order."""
-    tree = cKDTree(points)
+    tree = KDTree(points)
     free = np.ones(len(points), dtype=bool)
     chosen = []
     for i in range(len(points)):
@@ -140,7 +152,7 @@ def _spread(points: Float[np.ndarray, "points 3"], spacing: float) -> np.ndarray
     return np.asarray(chosen)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class _Contact(Prepared):
     skin: Attached
@@ -162,9 +174,7 @@ class _Contact(Prepared):
         pick = jnp.argmin(squared, axis=1)
         centre = jnp.take_along_axis(self.candidates, pick, axis=1)
         patch = self.table[centre]
-        corners = [
-            skin[self.faces[patch][..., k], :, lane[..., None]] for k in range(3)
-        ]
+        corners = [skin[self.faces[patch][..., k], :, lane[..., None]] for k in range(3)]
         # [vertices, batch, patch, 3] with the component first for element-wise work.
         corners = [jnp.moveaxis(c, -1, 0) for c in corners]
         p = jnp.moveaxis(points, 1, 0)[..., None]
@@ -223,9 +233,7 @@ class _Contact(Prepared):
         }
 
 
-def _surface(
-    skin: Placed, faces: Array, face: Array, weights: Array
-) -> tuple[Array, Array]:
+def _surface(skin: Placed, faces: Array, face: Array, weights: Array) -> tuple[Array, Array]:
     """Points and smooth normals of the skin, shape [vertices, 3, batch]."""
     lane = jnp.arange(skin.points.shape[2])[None]
     tri = faces[face]

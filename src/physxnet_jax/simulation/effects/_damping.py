@@ -3,9 +3,9 @@
 import dataclasses
 import math
 
-import jax
 from jaxtyping import Array
 
+from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
 
@@ -27,7 +27,7 @@ class Damping(Effect):
         return _Damping(self.rate)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class _Damping(Prepared):
     rate: float = dataclasses.field(metadata={"static": True})

@@ -2,9 +2,9 @@
 
 import dataclasses
 
-import jax
 from jaxtyping import Array
 
+from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
 
@@ -24,7 +24,7 @@ class Gravity(Effect):
         return _Gravity(self.g)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class _Gravity(Prepared):
     g: float = dataclasses.field(metadata={"static": True})

@@ -2,11 +2,11 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Int
 
+from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Attached, Effect, Placed, Prepared
 
@@ -26,7 +26,7 @@ class Pin(Effect):
         return _Pin(jnp.asarray(rows.astype(np.int32)), attached)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class _Pin(Prepared):
     index: Int[Array, " pins"]
@@ -48,6 +48,4 @@ class _Pin(Prepared):
         step: tuple[float, float],
     ) -> Array:
         where, way = context
-        return displacement.at[self.index].set(
-            where + progress * way, unique_indices=True
-        )
+        return displacement.at[self.index].set(where + progress * way, unique_indices=True)

@@ -2,12 +2,12 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...geometry import greedy_colours, mesh_edges
+from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Effect, Prepared
 from ._coloured import scatter_rows
@@ -51,7 +51,8 @@ class Stretch(Effect):
             a, b = edges.vertices[members].T
             groups.append(
                 _Group(
-                    jnp.asarray(a), jnp.asarray(b),
+                    jnp.asarray(a),
+                    jnp.asarray(b),
                     float32(length[members])[:, None, None],
                     float32(compliance[members])[:, None, None],
                     float32(w[a])[:, None, None],
@@ -61,7 +62,7 @@ class Stretch(Effect):
         return _Stretch(tuple(groups), 1.0 / self.compression)
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class _Group:
     a: Int[Array, " members"]
@@ -72,7 +73,7 @@ class _Group:
     weight_b: Float[Array, "members 1 1"]
 
 
-@jax.tree_util.register_dataclass
+@pytree
 @dataclasses.dataclass(frozen=True)
 class _Stretch(Prepared):
     groups: tuple[_Group, ...]

@@ -1,0 +1,43 @@
+"""Shapes are checked by beartype; dtypes and ranks are never promoted silently."""
+
+import os
+import pathlib
+
+import jaxtyping
+import pytest
+
+jaxtyping.install_import_hook("physxnet_jax", "beartype.beartype")
+
+import jax  # noqa: E402
+
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _free_compiled_code():
+    """Each compiled function holds memory maps, of which a process has 65,530."""
+    yield
+    jax.clear_caches()
+
+
+@pytest.fixture(scope="session")
+def data_dir() -> pathlib.Path:
+    """The folder of real motion and garments; skips where there is none."""
+    default = pathlib.Path(__file__).parents[2] / "shared"
+    path = pathlib.Path(os.environ.get("PHYSXNET_DATA", default))
+    if not (path / "mocap" / "ACTIONS.csv").is_file():
+        pytest.skip(f"no motion data at {path}: set PHYSXNET_DATA")
+    return path
+
+
+@pytest.fixture(scope="session")
+def body():
+    from physxnet_jax.body import load_body
+
+    return load_body()
+
+
+@pytest.fixture(scope="session")
+def rest(body):
+    return body.rest_vertices(body.default_shape())

@@ -1,0 +1,87 @@
+"""Closest points: against a dense search, at singular points, and signed."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given, settings, strategies as st
+
+from physxnet_jax.geometry import (
+    closest_among,
+    closest_barycentric,
+    closest_points,
+    make_mesh,
+    nearby_faces,
+    signed_distance,
+)
+
+_COORDINATE = st.floats(-2, 2, width=32)
+_POINT = st.tuples(_COORDINATE, _COORDINATE, _COORDINATE)
+
+
+@settings(max_examples=60, deadline=None)
+@given(p=_POINT, a=_POINT, b=_POINT, c=_POINT)
+def test_no_sampled_point_of_the_triangle_is_nearer(p, a, b, c):
+    p, a, b, c = (np.asarray(x, np.float32) for x in (p, a, b, c))
+    weights, squared = closest_barycentric(*(jnp.asarray(x)[:, None] for x in (p, a, b, c)))
+    w = np.asarray(weights)[:, 0]
+    assert np.isfinite(w).all() and w.min() >= -1e-5 and w.sum() == pytest.approx(1, abs=1e-4)
+    u, v = np.meshgrid(np.linspace(0, 1, 21), np.linspace(0, 1, 21))
+    keep = u + v <= 1
+    grid = a + u[keep][:, None] * (b - a) + v[keep][:, None] * (c - a)
+    best = np.sum((grid - p) ** 2, axis=1).min()
+    assert float(squared[0]) <= best + 1e-3
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        [[0, 0, 0], [0, 0, 0], [0, 0, 0]],
+        [[0, 0, 0], [1, 0, 0], [2, 0, 0]],
+        [[0, 0, 0], [1, 0, 0], [1, 1e-6, 0]],
+    ],
+)
+def test_degenerate_triangles_have_finite_value_and_gradient(corners):
+    a, b, c = (jnp.asarray(x, jnp.float32)[:, None] for x in corners)
+
+    def distance(p):
+        return closest_barycentric(p[:, None], a, b, c)[1][0]
+
+    value, slope = jax.value_and_grad(distance)(jnp.array([0.3, 0.4, 0.5]))
+    assert bool(jnp.isfinite(value)) and bool(jnp.isfinite(slope).all())
+    nearest = {0: 0.5, 1: 0.41, 2: 0.41}
+    expected = nearest[0] if corners[1] == [0, 0, 0] else 0.41
+    assert float(value) == pytest.approx(expected, abs=1e-4)
+
+
+def test_signed_distance_of_a_sphere():
+    s = trimesh.creation.icosphere(subdivisions=4)
+    mesh = make_mesh(s.vertices, s.faces)
+    points = np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3)).astype(np.float32)
+    expected = np.linalg.norm(points, axis=1) - 1
+    ours = np.asarray(signed_distance(mesh, jnp.asarray(points)))
+    np.testing.assert_allclose(ours, expected, atol=3e-3)
+
+
+def test_signs_are_right_in_front_of_edges_and_corners_of_a_box():
+    box = trimesh.creation.box((1, 1, 1))
+    mesh = make_mesh(box.vertices, box.faces)
+    points = np.random.default_rng(1).uniform(-1, 1, (500, 3)).astype(np.float32)
+    inside = (np.abs(points) < 0.5).all(axis=1)
+    ours = np.asarray(signed_distance(mesh, jnp.asarray(points)))
+    assert ((ours < 0) == inside).all()
+
+
+def test_candidates_find_what_brute_force_finds(body):
+    mesh = body.rest_mesh()
+    rng = np.random.default_rng(2)
+    v = np.asarray(mesh.vertices)
+    points = v[rng.choice(len(v), 300, replace=False)] + rng.normal(0, 0.01, (300, 3))
+    points = points.astype(np.float32)
+    exact = closest_points(mesh, jnp.asarray(points))
+    near = nearby_faces(v, np.asarray(mesh.faces), points, neighbours=8)
+    quick = closest_among(mesh, jnp.asarray(points), jnp.asarray(near))
+    miss = np.sqrt(np.asarray(quick.squared_distance)) - np.sqrt(np.asarray(exact.squared_distance))
+    assert (miss > -1e-5).all()
+    assert (miss > 1e-5).mean() < 0.01 and miss.max() < 2e-3
