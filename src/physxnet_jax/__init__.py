@@ -6,29 +6,33 @@
 'walk.npz'
 """
 
+import sys as _sys
+
 from ._environment import check_jaxlib as _check_jaxlib
 from ._version import __version__ as __version__
 
-_check_jaxlib()
+# `physxnet doctor` must be able to say what is wrong.
+if _sys.argv[1:2] != ["doctor"]:
+    _check_jaxlib()
 
-from .body import Body as Body, load_body as load_body  # noqa: E402
-from .dressing import DressedClip as DressedClip, dress as dress  # noqa: E402
-from .errors import PhysXNetError as PhysXNetError  # noqa: E402
-from .garment import Fabric as Fabric, Garment as Garment, template as template  # noqa: E402
-from .io import (  # noqa: E402
+from .body import Body as Body, load_body as load_body
+from .dressing import DressedClip as DressedClip, dress as dress
+from .errors import PhysXNetError as PhysXNetError
+from .garment import Fabric as Fabric, Garment as Garment, template as template
+from .io import (
     load_garment as load_garment,
     load_predictor as load_predictor,
     write_clip as write_clip,
 )
-from .models import (  # noqa: E402
+from .models import (
     Predictor as Predictor,
     dress_frames as dress_frames,
     make_wearable as make_wearable,
     pad_clip as pad_clip,
 )
-from .motion import Motion as Motion, load_motion as load_motion  # noqa: E402
-from .simulation import Scene as Scene, simulate as simulate  # noqa: E402
-from .uv import bind as bind, make_atlas as make_atlas  # noqa: E402
+from .motion import Motion as Motion, load_motion as load_motion
+from .simulation import Scene as Scene, simulate as simulate
+from .uv import bind as bind, make_atlas as make_atlas
 
 __all__ = [
     "Body",

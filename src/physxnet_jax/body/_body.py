@@ -129,11 +129,12 @@ class Body:
         """All zeros: the young woman that garments are modelled on."""
         return jnp.zeros((len(self.shape_names),), jnp.float32)
 
-    def shape(self, **values: float) -> Float[Array, " shapes"]:
+    def shape(self, **values: float | int) -> Float[Array, " shapes"]:
         """Shape parameters by name.
 
         Raises:
-            PhysXNetError: A name that isn't in ``shape_names``.
+            PhysXNetError: A name that isn't in ``shape_names``, or a value outside
+                [-1, 2], beyond which bodies fall apart.
 
         Example:
             >>> load_body().shape(gender=1.0, weight_up=0.5).shape
@@ -145,7 +146,10 @@ class Body:
                 f"Unknown shape parameter {sorted(unknown)}; there are"
                 f" {', '.join(self.shape_names)}."
             )
-        return jnp.asarray([values.get(name, 0.0) for name in self.shape_names], jnp.float32)
+        for name, value in values.items():
+            if not -1.0 <= value <= 2.0:
+                raise PhysXNetError(f"{name}={value}: expected a number from 0 to 1.")
+        return jnp.asarray([float(values.get(name, 0.0)) for name in self.shape_names], jnp.float32)
 
     def a_pose(self) -> Float[Array, "joints 4"]:
         """The rest pose: arms 45 degrees down. All identities."""

@@ -44,6 +44,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         Console(stderr=True, soft_wrap=True).print(f"physxnet: {error}", style="red", markup=False)
         return 1 if isinstance(error, BrokenInstallError) else 2
+    except OSError as error:
+        if command.debug:
+            raise
+        Console(stderr=True, soft_wrap=True).print(f"physxnet: {error}", style="red", markup=False)
+        return 2
     except KeyboardInterrupt:
         Console(stderr=True).print("physxnet: stopped; nothing half-written is left.")
         return 130
@@ -106,11 +111,13 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
             fps=command.fps,
             source_fps=command.source_fps,
             skeleton=command.skeleton,
+            shape=shape,
         )
         clip = dress(
             motion,
             command.wear,
             method=command.method,
+            fps=command.fps,
             frames=command.frames,
             weights=command.weights,
             shape=shape,

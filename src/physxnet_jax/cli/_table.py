@@ -31,9 +31,13 @@ def closing_table(clip: DressedClip) -> list[Table]:
         fit.add_row(
             m.name,
             str(m.positions.shape[1]),
-            f"{100 * clip.hit_rate[m.name]:.1f} %",
-            str(clip.fallbacks[m.name]),
-            f"{100 * clip.inside_raw[m.name]:.2f} %",
-            f"{100 * clip.inside[m.name]:.2f} %",
+            _share(clip.hit_rate[m.name], 1),
+            "-" if clip.fallbacks[m.name] is None else str(clip.fallbacks[m.name]),
+            _share(clip.inside_raw[m.name], 2),
+            _share(clip.inside[m.name], 2),
         )
     return [times, fit]
+
+
+def _share(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{100 * value:.{digits}f} %"

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..garment import TEMPLATES, Template, template
-from ..motion import animate
+from ..motion import Motion, animate
 from ..simulation import XPBD, PreparedScene, Scene, prepare_scene, simulate_batch
 from ._protocol import Action, load_action
 from ._store import write_action, write_offsets
@@ -56,6 +56,12 @@ def build_dataset(
         rollout = simulate_batch(scene, [motion], solver=solver)[0]
         offsets = rollout.positions[0] - skinned_cloth(scene, motion)
         worst = {key: float(np.max(v)) for key, v in rollout.diagnostics.items() if key != "finite"}
+        if not np.isfinite(offsets).all() or np.abs(offsets).max() > 3.0:
+            # It stays on record as failed; one explosion doesn't stop a build.
+            offsets = np.zeros_like(offsets)
+            failed = True
+        else:
+            failed = not rollout.finite.all()
         write_offsets(
             target,
             name,
@@ -65,7 +71,7 @@ def build_dataset(
                 "substeps": solver.substeps,
                 "queries": solver.queries,
                 "fps": motion.fps,
-                "finite": bool(rollout.finite.all()),
+                "finite": not failed,
                 "worst": worst,
             },
         )
@@ -75,7 +81,7 @@ def build_dataset(
     return done
 
 
-def skinned_cloth(scene: PreparedScene, motion) -> np.ndarray:
+def skinned_cloth(scene: PreparedScene, motion: Motion) -> np.ndarray:
     """Linear blend skinning of a scene's cloth [m], frame by frame."""
     a = scene.assembly
     moved = animate(

@@ -32,6 +32,8 @@ from ..motion import (
     clip_transforms,
     load_motion,
     padded_block,
+    resample,
+    stand_on_floor,
 )
 from ..simulation import XPBD, Scene, prepare_scene, simulate_batch
 from ..uv import Binding, Transference, bind
@@ -66,9 +68,11 @@ class DressedClip:
         meshes: The body (unless left out) and the garments in the order worn.
         fps: Frames a second.
         stages: Where the time went.
-        hit_rate: For each garment, share of vertices whose ray met the body.
-        fallbacks: For each garment, vertices bound by the closest point.
-        inside_raw: For each garment, share of vertices inside the body as computed.
+        hit_rate: For each garment, share of vertices whose ray met the body; None
+            where no ray is cast (lbs, simulate).
+        fallbacks: For each garment, vertices bound by the closest point; likewise.
+        inside_raw: For each garment, share of vertices below the skin near them, as
+            computed. Another limb's skin isn't looked at.
         inside: The same in the result, after the push-out.
         method: How the cloth was made.
         notes: What the reader should know about it.
@@ -77,8 +81,8 @@ class DressedClip:
     meshes: tuple[AnimatedMesh, ...]
     fps: float
     stages: tuple[Stage, ...]
-    hit_rate: dict[str, float]
-    fallbacks: dict[str, int]
+    hit_rate: dict[str, float | None]
+    fallbacks: dict[str, int | None]
     inside_raw: dict[str, float]
     inside: dict[str, float]
     method: str
@@ -100,7 +104,7 @@ def dress(
     wear: Sequence[Garment | str | pathlib.Path] = ("top", "bottom"),
     *,
     method: Method = "network",
-    fps: float = 30.0,
+    fps: float | int = 30.0,
     frames: int | None = None,
     weights: str | pathlib.Path = DEFAULT,
     body: Body | None = None,
@@ -138,12 +142,19 @@ def dress(
     """
     if method not in METHODS:
         raise PhysXNetError(f"No method '{method}'; there are {', '.join(METHODS)}.")
+    if frames is not None and frames < 1:
+        raise PhysXNetError(f"frames is {frames}; ask for at least one.")
     stages: list[Stage] = []
     watch = _Watch(stages)
     body = load_body() if body is None else body
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     with watch("motion"):
-        clip = motion if isinstance(motion, Motion) else load_motion(motion, fps=fps)
+        if isinstance(motion, Motion):
+            clip = motion if motion.fps == fps else resample(motion, fps)
+            if shape is not None:
+                clip = stand_on_floor(body, clip, rest)
+        else:
+            clip = load_motion(motion, fps=fps, body=body, shape=shape)
         if frames is not None:
             clip = Motion(clip.rotations[:frames], clip.root[:frames], clip.fps, clip.name)
         world, shift = clip_transforms(body, rest, clip)
@@ -151,8 +162,8 @@ def dress(
         garments = _named(
             [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
         )
-    hits = {g.name: 1.0 for g in garments}
-    fallbacks = {g.name: 0 for g in garments}
+    hits: dict[str, float | None] = {g.name: None for g in garments}
+    fallbacks: dict[str, int | None] = {g.name: None for g in garments}
     predictor = None
     if method == "network":
         with watch("weights"):
@@ -240,7 +251,7 @@ def fit_surface(
     predictor: Predictor, body: Body, rest: Float[Array, "all 3"], shape: Any | None
 ) -> Predictor:
     """The predictor with its texels on a body of another shape."""
-    if shape is None:
+    if shape is None and body is load_body():
         return predictor
     surface = make_surface(predictor.atlas, body, rest, predictor.surface.valid)
     return dataclasses.replace(predictor, surface=surface)
@@ -392,11 +403,13 @@ def _heights(patch: SkinPatch, x: Array, r: Array, t: Array) -> Array:
 
 def _named(garments: list[Garment]) -> list[Garment]:
     """Garments with names that differ."""
-    seen: dict[str, int] = {}
+    taken = {"body"}
     out = []
     for g in garments:
-        seen[g.name] = seen.get(g.name, 0) + 1
-        name = g.name if seen[g.name] == 1 else f"{g.name}_{seen[g.name]}"
+        name, count = g.name, 2
+        while name in taken:
+            name, count = f"{g.name}_{count}", count + 1
+        taken.add(name)
         out.append(dataclasses.replace(g, name=name))
     if not out:
         raise PhysXNetError("Nothing to wear: name at least one garment.")

@@ -79,7 +79,7 @@ def push_out(
     """Points lifted to a small gap above the skin where they are below it.
 
     Continuous in its inputs. Points deeper than ``deepest`` are on another limb's far
-    side, not in the skin, and stay.
+    side, not in the skin, and stay; in the last quarter before it the lift fades out.
 
     Args:
         patch: The skin near each point.
@@ -90,5 +90,6 @@ def push_out(
         deepest: Depth from which on nothing is done [m].
     """
     height, normal = skin_height(patch, points, rotations, translations)
-    lift = jnp.where(height > -deepest, jnp.maximum(gap - height, 0.0), 0.0)
+    fade = jnp.clip((height + deepest) / (0.25 * deepest), 0.0, 1.0)
+    lift = fade * jnp.maximum(gap - height, 0.0)
     return points + lift[:, None] * normal

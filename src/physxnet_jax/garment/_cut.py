@@ -43,7 +43,7 @@ def cut(
     rows: sp.csr_matrix,
     faces: Int[np.ndarray, "faces 3"],
     field: Float[np.ndarray, " vertices"],
-) -> tuple[sp.csr_matrix, Int[np.ndarray, "faces 3"], Int[np.ndarray, " kept"]]:
+) -> tuple[sp.csr_matrix, Int[np.ndarray, "pieces 3"], Int[np.ndarray, " kept"]]:
     """The part of a mesh where a field is negative, with its border on the zero level.
 
     Vertices close to the level are moved onto it along their shortest crossing edge;
@@ -130,7 +130,7 @@ def refine(
     faces: Int[np.ndarray, "faces 3"],
     rest: Float[np.ndarray, "all 3"],
     max_edge: float,
-) -> tuple[sp.csr_matrix, Int[np.ndarray, "faces 3"]]:
+) -> tuple[sp.csr_matrix, Int[np.ndarray, "pieces 3"]]:
     """Halves edges longer than a limit, the longest of each face first.
 
     Args:

@@ -223,5 +223,8 @@ def _sign(
     foot = jnp.einsum("pk,pkc->pc", hit.weights, mesh.vertices[tri])
     gap = points - foot
     side = jnp.sum(gap * safe_normalize(normal), axis=1)
-    distance = jnp.sqrt(hit.squared_distance)
+    squared = hit.squared_distance
+    zero = squared <= 0
+    one = jnp.ones_like(squared)
+    distance = jnp.where(zero, jnp.zeros_like(squared), jnp.sqrt(jnp.where(zero, one, squared)))
     return jnp.where(side < 0, -distance, distance)

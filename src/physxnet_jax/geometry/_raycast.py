@@ -9,6 +9,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..typing import pytree
 from ._mesh import TriMesh
+from ._rotation import safe_norm
 from ._topology import mesh_edges
 
 # Rays per chunk: [vertices, rays] blocks of a 13,000-vertex body then fit the cache.
@@ -136,7 +137,7 @@ def _cast_chunk(
 ) -> RayHits:
     """Hits of a block of rays; the ray axis is minor, so gathers move whole rows."""
     dtype = vertices.dtype
-    length = jnp.sqrt(jnp.sum(directions * directions, axis=1))
+    length = safe_norm(directions)
     usable = length > 0
     unit = directions / jnp.where(usable, length, 1.0)[:, None]
     kz = jnp.argmax(jnp.abs(unit), axis=1)

@@ -50,7 +50,7 @@ def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " 
     """Closed chains of boundary vertices, longest first.
 
     Each loop runs in the direction of its faces' half edges. A boundary that
-    touches itself in one vertex comes out as two loops.
+    touches itself in a vertex comes out as one loop that passes it twice.
     """
     f = np.asarray(faces, dtype=np.int64)
     edges = mesh_edges(f)
@@ -146,7 +146,9 @@ def greedy_colours(
     used = np.zeros((num_vertices, 64), dtype=bool)
     colour = np.empty(len(e), dtype=np.int64)
     for i, members in enumerate(e):
-        free = int(np.argmin(used[members].any(axis=0)))
+        free = int(np.argmin(np.append(used[members].any(axis=0), False)))
+        if free == used.shape[1]:
+            used = np.pad(used, ((0, 0), (0, 64)))
         colour[i] = free
         used[members, free] = True
     return [

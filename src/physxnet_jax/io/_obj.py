@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import FormatError
+from ..files import whole_file
 
 _MAX_BYTES = 500_000_000
 
@@ -62,12 +63,12 @@ def read_obj(path: str | pathlib.Path) -> ObjMesh:
         if words[0] == "v":
             vertices.append(_floats(path, n, words[1:4], 3))
         elif words[0] == "vt":
-            uv.append(_floats(path, n, words[1:3], 2))
+            uv.append(_floats(path, n, [*words[1:3], "0"][:2], 2))
         elif words[0] == "f":
             polygons.append([_corner(path, n, w, len(vertices), len(uv)) for w in words[1:]])
             where.append(n)
-            if len(polygons[-1]) < 3:
-                raise FormatError(f"{path}:{n}: a face of {len(words) - 1} corners. Delete it.")
+            if len({c[0] for c in polygons[-1]}) < 3:
+                raise FormatError(f"{path}:{n}: a face of fewer than three vertices. Delete it.")
     if not vertices or not polygons:
         raise FormatError(
             f"{path}: {len(vertices)} vertices and {len(polygons)} faces; a mesh needs both."
@@ -100,7 +101,6 @@ def write_obj(
     uv_faces: Int[np.ndarray, "faces 3"] | None = None,
 ) -> None:
     """Writes one mesh, atomically; positions [m]."""
-    path = pathlib.Path(path)
     lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in np.asarray(vertices)]
     if uv is not None and uv_faces is not None:
         lines += [f"vt {a:.6g} {b:.6g}" for a, b in np.asarray(uv)]
@@ -108,9 +108,8 @@ def write_obj(
         lines += ["f " + " ".join(f"{a}/{b}" for a, b in f) for f in pairs]
     else:
         lines += ["f " + " ".join(str(a) for a in f) for f in np.asarray(faces) + 1]
-    part = path.with_name(path.name + ".part")
-    part.write_text("\n".join(lines) + "\n")
-    part.replace(path)
+    with whole_file(path) as part:
+        part.write_text("\n".join(lines) + "\n")
 
 
 def _floats(path: pathlib.Path, n: int, words: list[str], count: int) -> list[float]:
@@ -132,6 +131,8 @@ def _corner(path: pathlib.Path, n: int, word: str, vertices: int, uvs: int) -> t
         t = int(parts[1]) if len(parts) > 1 and parts[1] else 0
     except ValueError:
         raise FormatError(f"{path}:{n}: '{word[:40]}' isn't a face corner. Export again.") from None
+    if a == 0 or (len(parts) > 1 and parts[1] and t == 0) or t < -uvs:
+        raise FormatError(f"{path}:{n}: '{word[:40]}' isn't an index from 1. Export again.")
     a = a - 1 if a > 0 else vertices + a
     t = t - 1 if t > 0 else (uvs + t if t < 0 else -1)
     return a, t

@@ -7,19 +7,17 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import FormatError
+from ..files import whole_file
 
 _HEADER = struct.Struct("<12siiffi")
 
 
 def write_pc2(path: str | pathlib.Path, positions: Float[np.ndarray, "frames vertices 3"]) -> None:
     """Writes a cache of positions [m], one sample a frame from frame 0, atomically."""
-    path = pathlib.Path(path)
     frames, vertices, _ = positions.shape
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    with whole_file(path) as part, part.open("wb") as file:
         file.write(_HEADER.pack(b"POINTCACHE2\0", 1, vertices, 0.0, 1.0, frames))
         file.write(np.ascontiguousarray(positions, dtype="<f4").tobytes())
-    part.replace(path)
 
 
 def read_pc2(path: str | pathlib.Path) -> Float[np.ndarray, "frames vertices 3"]:

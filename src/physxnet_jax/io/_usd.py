@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import MissingDependencyError
+from ..files import whole_file
 from ._clip import AnimatedMesh, smooth_normals, vertex_velocities
 
 
@@ -28,13 +29,18 @@ def write_usd(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: flo
         MissingDependencyError: Without usd-core.
     """
     try:
-        from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
+        import pxr  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(
             "Writing USD needs usd-core: pip install 'physxnet-jax[usd]'."
         ) from error
-    path = pathlib.Path(path)
-    part = path.with_name(f".part-{path.name}")
+    with whole_file(path) as part:
+        _write(part, meshes, fps)
+
+
+def _write(part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
+    from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
+
     stage = Usd.Stage.CreateNew(str(part))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
     UsdGeom.SetStageMetersPerUnit(stage, 1.0)
@@ -48,11 +54,10 @@ def write_usd(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: flo
     def vectors(x: np.ndarray) -> "Vt.Vec3fArray":
         return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(x, dtype=np.float32))
 
+    taken: set[str] = set()
     for m in meshes:
-        name = re.sub(r"\W", "_", m.name) or "mesh"
-        prim = UsdGeom.Mesh.Define(
-            stage, f"/Person/{name if not name[0].isdigit() else '_' + name}"
-        )
+        name = _prim_name(m.name, taken)
+        prim = UsdGeom.Mesh.Define(stage, f"/Person/{name}")
         prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(m.faces), 3, np.int32)))
         prim.CreateFaceVertexIndicesAttr(
             Vt.IntArray.FromNumpy(np.ascontiguousarray(m.faces.reshape(-1), dtype=np.int32))
@@ -89,4 +94,13 @@ def write_usd(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: flo
         UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
     stage.GetRootLayer().Save()
     del stage
-    part.replace(path)
+
+
+def _prim_name(name: str, taken: set[str]) -> str:
+    """A name that USD accepts and no other mesh has."""
+    safe = re.sub(r"[^A-Za-z0-9_]", "_", name) or "mesh"
+    safe = f"_{safe}" if safe[0].isdigit() else safe
+    while safe in taken or safe == "Looks":
+        safe += "_"
+    taken.add(safe)
+    return safe

@@ -15,6 +15,7 @@ from safetensors.numpy import load as load_tensors, save as save_tensors
 
 from ..body import load_body
 from ..errors import WeightsError
+from ..files import whole_file
 from ..models import (
     ModelConfig,
     Normalisation,
@@ -44,10 +45,15 @@ def save_predictor(
         card: Anything else to tell: data, licence, measured table.
     """
     folder = pathlib.Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    leaves = jax.tree.leaves(predictor.state)
-    tensors: dict[str, np.ndarray]
-    tensors = {f"leaf_{k:03d}": np.asarray(x).astype(np.float16) for k, x in enumerate(leaves)}
+    tensors: dict[str, np.ndarray] = {}
+    for k, (path, x) in enumerate(jax.tree_util.tree_leaves_with_path(predictor.state)):
+        # Batch statistics keep float32: a variance may leave the range of float16.
+        kernel = "kernel" in jax.tree_util.keystr(path)
+        tensors[f"leaf_{k:03d}"] = np.asarray(x).astype(np.float16 if kernel else np.float32)
+        if not np.isfinite(tensors[f"leaf_{k:03d}"]).all():
+            raise WeightsError(
+                f"{name}: {jax.tree_util.keystr(path)} isn't finite in half precision."
+            )
     for t, mask in predictor.surface.valid.items():
         tensors[f"valid_{t}"] = np.packbits(np.asarray(mask))
     blob = save_tensors(tensors)
@@ -65,9 +71,8 @@ def save_predictor(
         **(card or {}),
     }
     for file, data in ((_TENSORS, blob), (_CARD, json.dumps(info, indent=1).encode())):
-        part = folder / f"{file}.part"
-        part.write_bytes(data)
-        part.replace(folder / file)
+        with whole_file(folder / file) as part:
+            part.write_bytes(data)
 
 
 def list_weights() -> list[str]:
@@ -95,6 +100,16 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
             weights were trained on.
     """
     folder = _folder(weights)
+    try:
+        return _load(weights, folder)
+    except (KeyError, TypeError, json.JSONDecodeError, OSError) as error:
+        raise WeightsError(
+            f"{weights}: the card or the tensors are damaged ({error!r}). Reinstall or copy"
+            " them again."
+        ) from error
+
+
+def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
     card = json.loads((folder / _CARD).read_text())
     blob = (folder / _TENSORS).read_bytes()
     digest = hashlib.sha256(blob).hexdigest()

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import FormatError
+from ..files import whole_file
 from ._clip import AnimatedMesh
 from ._obj import write_obj
 from ._pc2 import write_pc2
@@ -41,7 +42,6 @@ def write_clip(
         FormatError: Another extension.
     """
     path = check_output(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     suffix = path.suffix.lower()
     if suffix.startswith(".usd"):
         write_usd(path, meshes, fps)
@@ -51,10 +51,8 @@ def write_clip(
         for m in meshes:
             arrays[f"{m.name}_positions"] = m.positions
             arrays[f"{m.name}_faces"] = m.faces
-        part = path.with_name(path.name + ".part")
-        with part.open("wb") as file:
+        with whole_file(path) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
-        part.replace(path)
         return [path]
     written = []
     for m in meshes:

@@ -91,7 +91,8 @@ class Generator(nnx.Module):
 class Discriminator(nnx.Module):
     """D: a PatchGAN that judges offset maps given the motion maps.
 
-    Returns logits; each judges a patch of about 70 texels.
+    Returns logits; each judges a patch of 46 texels (the receptive field
+    of three strided layers and the head).
 
     References:
         Isola et al., pix2pix (2017), section 3.2.2.

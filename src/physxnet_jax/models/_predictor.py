@@ -29,14 +29,12 @@ class ModelConfig:
         resolution: Texels a side, a multiple of 16.
         width: Channels of the first layer.
         templates: Templates with a decoder.
-        dtype: Arithmetic of the network, ``float32`` or ``bfloat16``.
     """
 
     family: Family = "local"
     resolution: int = 128
     width: int = 32
     templates: tuple[str, ...] = ("top", "bottom", "dress")
-    dtype: str = "float32"
 
 
 @pytree
@@ -154,7 +152,7 @@ class Predictor:
         """Offsets [m] from normalised features, see `normalise`."""
         network = nnx.merge(self.graph, self.state)
         network.eval()
-        maps = self.atlas.to_map(features).astype(jnp.dtype(self.config.dtype))
+        maps = self.atlas.to_map(features)
         out = network(maps, tuple(templates))
         return {
             t: jnp.where(

@@ -132,12 +132,14 @@ def _read_asf(
         if key.startswith(":"):
             section = key[1:]
         elif section == "units" and key == "angle":
-            degrees = not words[1].lower().startswith("rad")
+            degrees = not "".join(words[1:2]).lower().startswith("rad")
         elif section == "root":
             if key == "order":
                 root.dof = [w.lower() for w in words[1:]]
             elif key == "axis":
-                root.order = words[1].lower()
+                root.order = "".join(words[1:2]).lower()
+                if sorted(root.order) != ["x", "y", "z"]:
+                    raise MotionError.at(path, n, f"root axis '{root.order}'", "Use XYZ")
         elif section == "bonedata":
             if key == "begin":
                 bone = _Bone()
@@ -163,6 +165,11 @@ def _read_asf(
                 bone.axis = Rotation.from_euler(bone.order, angles[pick], degrees=degrees)
             elif key == "dof":
                 bone.dof = [w.lower() for w in words[1:]]
+                known = {*_DOFS, "tx", "ty", "tz", "l"}
+                if set(bone.dof) - known or len(set(bone.dof)) != len(bone.dof):
+                    raise MotionError.at(
+                        path, n, f"unknown or repeated dof {bone.dof}", "Use rx ry rz"
+                    )
         elif section == "hierarchy" and key not in ("begin", "end"):
             links[words[0].lower()] = [w.lower() for w in words[1:]]
     if not bones or "root" not in links:
@@ -188,6 +195,7 @@ def _read_frames(
     moving = [name for name, bone in bones.items() if bone.dof]
     rows: dict[str, list[list[float]]] = {name: [] for name in moving}
     frame = 0
+    first: int | None = None
     for n, line in enumerate(lines, start=1):
         words = line.split()
         if not words or words[0][0] in "#:":
@@ -195,6 +203,15 @@ def _read_frames(
         if len(words) == 1 and words[0].lstrip("-").isdigit():
             _check_complete(path, n, rows, frame)
             frame += 1
+            if first is None:
+                first = int(words[0])
+            if int(words[0]) != first + frame - 1:
+                raise MotionError.at(
+                    path,
+                    n,
+                    f"frame {words[0]} where {first + frame - 1} was expected",
+                    "Frames are missing: export the clip again",
+                )
             continue
         name = words[0].lower()
         if frame == 0:

@@ -82,7 +82,10 @@ def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
                 raise MotionError.at(path, n, "a JOINT outside any joint", "Check braces")
             name = " ".join(words[1:]) or f"joint{len(names)}"
             # Some exporters prefix names with a namespace.
-            names.append(name.split(":")[-1])
+            name = name.split(":")[-1]
+            if name in names:
+                raise MotionError.at(path, n, f"a second joint '{name}'", "Rename one")
+            names.append(name)
             parents.append(stack[-1] if stack else -1)
             offsets.append([])
             channels.append([])
@@ -165,7 +168,7 @@ def _read_motion(
             path, start + 1, "no 'Frames:' after MOTION", "It is truncated: export again"
         )
     count = body[0][1].split(":")[1].split()
-    if len(count) != 1 or not count[0].isdigit() or int(count[0]) == 0:
+    if len(count) != 1 or not count[0].isdecimal() or int(count[0]) == 0:
         raise MotionError.at(
             path,
             body[0][0],
@@ -178,6 +181,13 @@ def _read_motion(
     if len(step) != 1 or step[0] <= 0:
         raise MotionError.at(path, body[1][0], "Frame Time must be positive", "Fix it")
     rows = body[2:]
+    if len(rows) > int(count[0]):
+        raise MotionError.at(
+            path,
+            rows[int(count[0])][0],
+            f"more lines than the {count[0]} frames announced",
+            "Correct 'Frames:'",
+        )
     if len(rows) < int(count[0]):
         raise MotionError.at(
             path,
@@ -198,4 +208,11 @@ def _read_motion(
         values.append(numbers(path, n, words))
     # 0.0083333 is meant to be 1/120.
     fps = 1.0 / step[0]
-    return np.asarray(values), round(fps) if abs(fps - round(fps)) < 0.05 else fps
+    if not 1.0 <= fps <= 2000.0:
+        raise MotionError.at(
+            path,
+            body[1][0],
+            f"a Frame Time of {step[0]} means {fps:.3g} frames a second",
+            "Write it in seconds: 0.00833333 for 120 fps",
+        )
+    return np.asarray(values), float(round(fps)) if abs(fps - round(fps)) < 0.05 else fps

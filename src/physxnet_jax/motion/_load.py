@@ -1,10 +1,15 @@
 """One door for every motion: a file of a known format or a built-in clip."""
 
+import math
 import pathlib
+from collections.abc import Mapping
 
 import numpy as np
+from jaxtyping import Array, Float
 
+from ..body import Body
 from ..errors import MotionError
+from ..files import whole_file
 from ._asf_amc import read_amc
 from ._bvh import read_bvh
 from ._motion import Motion, make_motion, resample
@@ -15,9 +20,12 @@ from ._retarget import retarget
 def load_motion(
     motion: str | pathlib.Path,
     *,
-    fps: float | None = None,
-    source_fps: float | None = None,
+    fps: float | int | None = None,
+    source_fps: float | int | None = None,
     skeleton: str | pathlib.Path | None = None,
+    joint_map: Mapping[str, str] | None = None,
+    body: Body | None = None,
+    shape: Float[Array, " shapes"] | None = None,
 ) -> Motion:
     """A motion by file or by name.
 
@@ -27,6 +35,9 @@ def load_motion(
         source_fps: True rate of the file, where its header is wrong or silent (CMU
             subjects 60 and 61 say 120 and are 60).
         skeleton: The ASF of an AMC file.
+        joint_map: Body joint to the file's joint, for a skeleton of unknown names.
+        body: Body to retarget to; the built-in one by default.
+        shape: Its shape parameters, whose proportions set how it stands and steps.
 
     Returns:
         The motion on the body's skeleton.
@@ -38,16 +49,19 @@ def load_motion(
         >>> load_motion("walk", fps=30).fps
         30.0
     """
+    for name, rate in (("fps", fps), ("source_fps", source_fps)):
+        if rate is not None and not (math.isfinite(rate) and rate > 0):
+            raise MotionError(f"{name} is {rate}, expected a positive number.")
     path = pathlib.Path(motion)
     suffix = path.suffix.lower()
     if suffix == ".bvh":
-        clip = retarget(read_bvh(path))
+        clip = retarget(read_bvh(path), body, joint_map=joint_map, shape=shape)
     elif suffix == ".amc":
-        clip = retarget(read_amc(path, skeleton))
+        clip = retarget(read_amc(path, skeleton), body, joint_map=joint_map, shape=shape)
     elif suffix == ".npz":
         clip = _load_npz(path)
     elif str(motion) in CLIPS:
-        clip = procedural_clip(str(motion), fps=fps or 30.0)
+        clip = procedural_clip(str(motion), fps=float(fps or 30), body=body, shape=shape)
     else:
         raise MotionError(
             f"{motion}: neither a .bvh, .amc or .npz file nor a built-in clip ({', '.join(CLIPS)})."
@@ -59,21 +73,18 @@ def load_motion(
 
 def save_motion(path: str | pathlib.Path, motion: Motion) -> None:
     """Writes a motion as `.npz` (rotations, root, fps), atomically."""
-    path = pathlib.Path(path)
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    with whole_file(path) as part, part.open("wb") as file:
         np.savez_compressed(
             file,
             rotations=np.asarray(motion.rotations),
             root=np.asarray(motion.root),
             fps=np.asarray(motion.fps),
         )
-    part.replace(path)
 
 
 def _load_npz(path: pathlib.Path) -> Motion:
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             return make_motion(data["rotations"], data["root"], float(data["fps"]), name=path.stem)
     except MotionError:
         raise

@@ -13,6 +13,8 @@ from ..typing import pytree
 
 # Frames compiled together: clips of any length are cut into blocks of this many.
 _BLOCK = 32
+# A root farther from the origin than this is a broken file [m].
+_FARTHEST = 1e5
 
 
 @pytree
@@ -38,7 +40,9 @@ class Motion:
         return self.root.shape[0]
 
 
-def make_motion(rotations: object, root: object, fps: float, *, name: str = "motion") -> Motion:
+def make_motion(
+    rotations: object, root: object, fps: float | int, *, name: str = "motion"
+) -> Motion:
     """A `Motion` from host arrays, checked and normalised.
 
     Args:
@@ -53,6 +57,8 @@ def make_motion(rotations: object, root: object, fps: float, *, name: str = "mot
     """
     r = np.asarray(rotations, dtype=np.float64)
     p = np.asarray(root, dtype=np.float64)
+    # Beyond this the cast to float32 would leave no millimetres.
+    p = np.where(np.abs(p) < _FARTHEST, p, np.nan)
     if r.ndim != 3 or r.shape[2] != 4 or p.shape != (len(r), 3) or len(r) == 0:
         raise MotionError(
             f"{name}: rotations {r.shape} and root {p.shape}, expected"
@@ -67,8 +73,8 @@ def make_motion(rotations: object, root: object, fps: float, *, name: str = "mot
             (int(x) for x in np.argwhere(bad)[0]) if bad.any() else (int(np.argmax(bad_root)), 0)
         )
         raise MotionError(
-            f"{name}: frame {frame}, joint {joint} is not finite. Cut the frame out or"
-            " interpolate over it."
+            f"{name}: frame {frame}, joint {joint} is not finite or over"
+            " 100 km away. Cut the frame out or interpolate over it."
         )
     length = np.linalg.norm(r, axis=2, keepdims=True)
     if (length < 1e-6).any():
@@ -107,7 +113,7 @@ def sample(motion: Motion, times: Float[np.ndarray, " frames"], fps: float) -> M
     return make_motion(rotations, root, fps, name=motion.name)
 
 
-def resample(motion: Motion, fps: float) -> Motion:
+def resample(motion: Motion, fps: float | int) -> Motion:
     """The same motion at another frame rate.
 
     Args:
@@ -179,6 +185,7 @@ def animate(
     Returns:
         Positions [m] of every frame.
     """
+    check_joints(body, motion)
     frames = motion.num_frames
     pick = np.minimum(np.arange(-(-frames // _BLOCK) * _BLOCK), frames - 1)
     rotations = np.asarray(motion.rotations)[pick].reshape(-1, _BLOCK, *motion.rotations.shape[1:])
@@ -188,6 +195,19 @@ def animate(
         for q, p in zip(rotations, root, strict=True)
     ]
     return jnp.asarray(np.concatenate(blocks)[:frames])
+
+
+def check_joints(body: Body, motion: Motion) -> None:
+    """Refuses a motion of another skeleton.
+
+    Raises:
+        MotionError: The numbers of joints differ.
+    """
+    if motion.rotations.shape[1] != len(body.parents):
+        raise MotionError(
+            f"{motion.name}: {motion.rotations.shape[1]} joints, but the body has"
+            f" {len(body.parents)}. Retarget the motion first."
+        )
 
 
 @jax.jit

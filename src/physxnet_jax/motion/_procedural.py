@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
 
 from ..body import Body, align_global, load_body
@@ -186,7 +186,12 @@ CLIPS: dict[str, Callable[[Time], tuple[Turns, Time]]] = {
 
 
 def procedural_clip(
-    name: str, *, fps: float = 30.0, seconds: float = 4.0, body: Body | None = None
+    name: str,
+    *,
+    fps: float = 30.0,
+    seconds: float = 4.0,
+    body: Body | None = None,
+    shape: Float[Array, " shapes"] | None = None,
 ) -> Motion:
     """A built-in clip on the body's skeleton.
 
@@ -197,6 +202,7 @@ def procedural_clip(
         fps: Frames a second.
         seconds: Duration; four seconds show every clip once.
         body: Body to drive; the built-in one by default.
+        shape: Its shape parameters.
 
     Returns:
         The motion.
@@ -212,7 +218,7 @@ def procedural_clip(
     down = {"Left": np.array([0.14, -1.0, 0.02]), "Right": np.array([-0.14, -1.0, 0.02])}
     stance = {f"{s}{b}": d for s, d in down.items() for b in ("Arm", "ForeArm")}
     stance |= {f"{s}{b}": -_Y for s in down for b in ("UpLeg", "Leg")}
-    aligned = align_global(body, stance)
+    aligned = align_global(body, stance, shape)
     local = np.zeros((len(t), len(body.parents), 4))
     for j, (joint, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
         # world = change * aligned, so the local turn is conjugated by the parent's.
@@ -220,12 +226,14 @@ def procedural_clip(
         up = aligned[parent].inv() if parent >= 0 else Rotation.identity()
         local[:, j] = (up * turn * aligned[j]).as_quat(scalar_first=True)
     motion = make_motion(local, np.zeros((len(t), 3)), fps, name=name)
-    return make_motion(local, _planted_root(body, motion, air), fps, name=name)
+    return make_motion(local, _planted_root(body, motion, air, shape), fps, name=name)
 
 
-def _planted_root(body: Body, motion: Motion, air: Time) -> Float[np.ndarray, "frames 3"]:
+def _planted_root(
+    body: Body, motion: Motion, air: Time, shape: Float[Array, " shapes"] | None
+) -> Float[np.ndarray, "frames 3"]:
     """Hips positions that keep the lower foot in place and the feet at height air."""
-    rest = body.rest_vertices(body.default_shape())
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     ankles = [body.joint("LeftFoot"), body.joint("RightFoot")]
     heads = body.joint_positions(rest)[0][jnp.asarray(ankles)]
     follow = jnp.zeros((2, len(body.parents))).at[jnp.arange(2), jnp.asarray(ankles)].set(1.0)

@@ -115,10 +115,19 @@ def retarget(
         Motion in metres, Y up.
 
     Raises:
-        MotionError: Unknown joints, or a skeleton without legs.
+        MotionError: Unknown joints, a map without the limbs, a limb of length zero.
     """
     body = load_body() if body is None else body
     joints = dict(joint_map) if joint_map is not None else find_joint_map(source)[1]
+    needed = {"Hips", *LIMBS, *LIMBS.values()}
+    if needed - joints.keys() or joints.keys() - set(body.joint_names):
+        raise MotionError.at(
+            source.path,
+            None,
+            f"the joint map lacks {sorted(needed - joints.keys())} and has unknown"
+            f" {sorted(joints.keys() - set(body.joint_names))}",
+            f"Map at least the limbs; the body has {', '.join(body.joint_names)}",
+        )
     index = {}
     for b, s in joints.items():
         if s not in source.names:
@@ -151,8 +160,6 @@ def retarget(
         + np.linalg.norm(positions[0, index[f"{s}Foot"]] - positions[0, index[f"{s}Leg"]])
         for s in ("Left", "Right")
     ]
-    if min(source_legs) <= 0:
-        raise MotionError.at(source.path, None, "legs of length zero", "Export again")
     scale = sum(legs) / sum(source_legs)
     hips = [index["LeftUpLeg"], index["RightUpLeg"]]
     middle = 0.5 * (heads[at("LeftUpLeg")] + heads[at("RightUpLeg")]) - heads[0]
@@ -195,7 +202,7 @@ def _foot_vertices(body: Body) -> Bool[np.ndarray, " vertices"]:
 
 def _reference(
     source: SourceClip, index: Mapping[str, int]
-) -> tuple[Float[np.ndarray, "joints 3 3"], int]:
+) -> tuple[Float[np.ndarray, "bones 3 3"], int]:
     """World rotations of the reference pose and the first frame of motion."""
     first = source.rotations[0]
     limbs = {k: v for k, v in index.items() if k in LIMBS and LIMBS[k] in index}
@@ -225,7 +232,7 @@ def _reference(
 def _limb_directions(
     source: SourceClip,
     index: Mapping[str, int],
-    rotations: Float[np.ndarray, "joints 3 3"],
+    rotations: Float[np.ndarray, "bones 3 3"],
 ) -> dict[str, Float[np.ndarray, "3"]]:
     """Unit directions of limb bones in a pose of the source skeleton."""
     position = np.zeros((len(source.names), 3))
@@ -235,7 +242,16 @@ def _limb_directions(
     out = {}
     for a, b in LIMBS.items():
         d = position[index[b]] - position[index[a]]
-        out[a] = d / max(float(np.linalg.norm(d)), 1e-12)
+        length = float(np.linalg.norm(d))
+        if length < 1e-9:
+            raise MotionError.at(
+                source.path,
+                None,
+                f"the bone from {source.names[index[a]]} to {source.names[index[b]]} has"
+                " length zero",
+                "Fix its OFFSET, or map other joints",
+            )
+        out[a] = d / length
     return out
 
 
@@ -243,7 +259,7 @@ def _world_rotations(
     body: Body,
     source: SourceClip,
     index: Mapping[str, int],
-    reference: Float[np.ndarray, "joints 3 3"],
+    reference: Float[np.ndarray, "bones 3 3"],
     aligned: list[Rotation],
     start: int,
 ) -> Float[np.ndarray, "frames joints 3 3"]:

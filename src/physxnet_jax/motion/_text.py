@@ -30,7 +30,7 @@ def read_lines(path: pathlib.Path, kind: str) -> list[str]:
             f"Convert it to {kind} text first (FBX and C3D are not read)",
         )
     try:
-        return blob.decode("utf-8").splitlines()
+        return blob.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         return blob.decode("latin-1").splitlines()
 

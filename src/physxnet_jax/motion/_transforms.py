@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import Body
-from ._motion import Motion
+from ._motion import Motion, check_joints
 
 BLOCK = 16
 """Frames computed together."""
@@ -16,6 +16,7 @@ def clip_transforms(
     body: Body, rest: Float[Array, "all 3"], motion: Motion
 ) -> tuple[Float[np.ndarray, "frames joints 3 3"], Float[np.ndarray, "frames joints 3"]]:
     """World rotations and translations [m] of the joints in every frame."""
+    check_joints(body, motion)
     frames = motion.num_frames
     pick = np.minimum(np.arange(-(-frames // BLOCK) * BLOCK), frames - 1)
     q, p = np.asarray(motion.rotations)[pick], np.asarray(motion.root)[pick]

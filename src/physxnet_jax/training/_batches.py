@@ -42,6 +42,7 @@ class Frames:
         targets: For each template, cloth offsets [0.1 mm], shape [frames, vertices, 3].
         usable: For each template, which frames count, shape [frames].
         fps: Frames a second.
+        identity: Names and lengths of the sequences: a run is tied to its data.
     """
 
     rotations: Float[np.ndarray, "frames window joints 3 3"]
@@ -49,6 +50,7 @@ class Frames:
     targets: dict[str, np.ndarray]
     usable: dict[str, Bool[np.ndarray, " frames"]]
     fps: float
+    identity: str
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -104,6 +106,7 @@ def load_frames(
         {t: cat(v) for t, v in targets.items()},
         {t: cat(v) for t, v in usable.items()},
         rates.pop(),
+        ", ".join(f"{s.name} {s.motion.num_frames}" for s in sequences),
     )
 
 

@@ -58,6 +58,6 @@ def _plain(state: TrainState) -> list[Any]:
     return jax.tree.leaves(state)
 
 
-def config_json(config: Any) -> str:
-    """A frozen config as JSON."""
-    return json.dumps(dataclasses.asdict(config), indent=1, sort_keys=True)
+def config_json(config: Any, data: str) -> str:
+    """A run as JSON: its frozen config and what it learns from."""
+    return json.dumps({**dataclasses.asdict(config), "data": data}, indent=1, sort_keys=True)

@@ -12,7 +12,8 @@ from flax import nnx
 
 from ..body import load_body
 from ..data import Sequence
-from ..errors import PhysXNetError
+from ..errors import FormatError, PhysXNetError
+from ..files import whole_file
 from ..garment import template
 from ..models import ModelConfig, Normalisation, Predictor, Surface, make_surface
 from ..uv import Atlas, garment_map_rows, make_atlas
@@ -86,7 +87,7 @@ def train(
     total = per_epoch * config.epochs
     stop = total if steps is None else min(steps, total)
     state, step, graph = make_step(config, atlas, surface, normalisation, tables, frames.fps, total)
-    (folder / "config.json").write_text(config_json(config))
+    _same_run(folder / "config.json", config_json(config, frames.identity))
     checkpoints = Checkpoints(folder / "checkpoints")
     restored = checkpoints.latest(state)
     state = state if restored is None else restored
@@ -99,6 +100,15 @@ def train(
                 index = batch_indices(len(frames), config.batch, config.seed, done)
                 state, metrics = step(state, take(frames, index), jax.random.fold_in(key, done))
                 done += 1
+                skipped = max(
+                    int(state.generator_opt.notfinite_count),
+                    int(state.discriminator_opt.notfinite_count),
+                )
+                if skipped >= config.max_skipped:
+                    raise PhysXNetError(
+                        f"step {done}: {skipped} updates in a row were not finite. Lower the"
+                        " learning rate or look for NaN in the data."
+                    )
                 if done % 20 == 0 or done == stop:
                     values = {k: float(v) for k, v in metrics.items()}
                     values |= {"step": done, "seconds": time.perf_counter() - began}
@@ -106,11 +116,6 @@ def train(
                     log.flush()
                     if report is not None:
                         report(done, stop, values)
-                    if int(state.generator_opt.notfinite_count) >= config.max_skipped:
-                        raise PhysXNetError(
-                            f"step {done}: {config.max_skipped} updates in a row were not"
-                            " finite. Lower the learning rate or look for NaN in the data."
-                        )
                 if done % config.checkpoint_every == 0:
                     checkpoints.save(state, {"step": done})
     finally:
@@ -118,6 +123,21 @@ def train(
             checkpoints.save(state, {"step": int(state.step)})
         checkpoints.close()
     return make_predictor(config.model, atlas, surface, normalisation, state, graph)
+
+
+def _same_run(path: pathlib.Path, text: str) -> None:
+    """Notes what a run is, or refuses to go on with another one in its folder."""
+    if path.is_file():
+        before, now = json.loads(path.read_text()), json.loads(text)
+        changed = [k for k in now if before.get(k) != now[k]]
+        if changed:
+            raise PhysXNetError(
+                f"{path.parent}: the run there has another {', '.join(changed)}. Choose"
+                " another folder or delete it."
+            )
+        return
+    with whole_file(path) as part:
+        part.write_text(text)
 
 
 def make_predictor(
@@ -143,8 +163,9 @@ def _normalisation(
     for t, c in tables.items():
         good = np.flatnonzero(frames.usable[t])
         if len(good) == 0:
-            offsets[t] = jnp.ones((1,), jnp.float32)
-            continue
+            raise FormatError(
+                f"no usable sequence for '{t}': simulate it, or drop it from the templates."
+            )
         pick = rng.choice(good, min(32, len(good)), replace=False)
         meters = target_offsets(
             jnp.asarray(frames.targets[t][pick]),

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FormatError, MissingDependencyError
+from ..files import whole_file
 from ..io import AnimatedMesh
 
 PREVIEWS = (".mp4", ".gif", ".png")
@@ -121,40 +122,36 @@ def render_preview(
         MissingDependencyError: Without the ``render`` extra.
     """
     path = check_preview(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        import imageio.v3 as iio
+        import imageio.v2 as imageio
     except ImportError as error:
         raise MissingDependencyError(
             "Videos need imageio: pip install 'physxnet-jax[render]'."
         ) from error
     frames = len(meshes[0].positions)
     stage = _Stage(meshes, size)
-    part = path.with_name(f".part-{path.name}")
     try:
-        if path.suffix == ".png":
-            picks = np.unique(np.linspace(0, frames - 1, 6).astype(int))
-            shots = [stage.shoot(int(k)) for k in picks]
-            iio.imwrite(part, np.concatenate(shots, axis=1), extension=".png")
-        else:
-            stride = 1 if path.suffix == ".mp4" else max(1, round(fps / 15))
-            shots = []
-            for k in range(0, frames, stride):
-                shots.append(stage.shoot(k))
-                if progress is not None:
-                    progress("preview", k + 1, frames)
-            if path.suffix == ".mp4":
-                with warnings.catch_warnings():
-                    # ffmpeg is started by fork and exec: nothing of JAX runs in between.
-                    warnings.filterwarnings("ignore", message=".*os.fork.*")
-                    iio.imwrite(part, np.stack(shots), fps=fps, extension=".mp4", codec="libx264")
-            else:
-                iio.imwrite(
-                    part, np.stack(shots), duration=1000 * stride / fps, loop=0, extension=".gif"
-                )
+        with whole_file(path) as part, warnings.catch_warnings():
+            # ffmpeg is started by fork and exec: nothing of JAX runs in between.
+            warnings.filterwarnings("ignore", message=".*os.fork.*")
+            if path.suffix.lower() == ".png":
+                picks = np.unique(np.linspace(0, frames - 1, 6).astype(int))
+                shots = [stage.shoot(int(k)) for k in picks]
+                imageio.imwrite(part, np.concatenate(shots, axis=1))
+                return path
+            stride = 1 if path.suffix.lower() == ".mp4" else max(1, round(fps / 15))
+            options: dict[str, Any] = (
+                {"fps": fps, "codec": "libx264", "macro_block_size": 16}
+                if stride == 1 and path.suffix.lower() == ".mp4"
+                else {"duration": 1000 * stride / fps, "loop": 0}
+            )
+            with imageio.get_writer(part, **options) as writer:
+                for k in range(0, frames, stride):
+                    writer.append_data(stage.shoot(k))  # pyright: ignore[reportAttributeAccessIssue]
+                    if progress is not None:
+                        progress("preview", k + 1, frames)
     finally:
         stage.plotter.close()
-    part.replace(path)
     return path
 
 
@@ -165,6 +162,6 @@ def check_preview(path: str | pathlib.Path) -> pathlib.Path:
         FormatError: Otherwise.
     """
     path = pathlib.Path(path)
-    if path.suffix not in PREVIEWS:
+    if path.suffix.lower() not in PREVIEWS:
         raise FormatError(f"{path}: a preview is one of {', '.join(PREVIEWS)}.")
     return path

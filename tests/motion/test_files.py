@@ -1,0 +1,232 @@
+"""Real clips of every family, and every way a file can be broken."""
+
+import csv
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from physxnet_jax.data import load_action, read_protocol
+from physxnet_jax.errors import MotionError
+from physxnet_jax.motion import (
+    LIMBS,
+    clip_transforms,
+    find_joint_map,
+    foot_heights,
+    load_motion,
+    read_amc,
+    read_bvh,
+    resample,
+    retarget,
+)
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation
+  JOINT Knee
+  {
+    OFFSET 0 -1 0
+    CHANNELS 3 Zrotation Yrotation Xrotation
+    End Site
+    {
+      OFFSET 0 -1 0
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.0083333
+0 1 0 0 0 0 0 0 0
+0 1 0 0 0 90 10 0 0
+"""
+ASF = """:version 1.10
+:units
+  mass 1.0
+  length 0.45
+  angle deg
+:root
+  order TX TY TZ RX RY RZ
+  axis XYZ
+  position 0 0 0
+  orientation 0 0 0
+:bonedata
+  begin
+    id 1
+    name lfemur
+    direction 0 -1 0
+    length 2
+    axis 0 0 20 XYZ
+    dof rx
+  end
+:hierarchy
+  begin
+    root lfemur
+  end
+"""
+AMC = ":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 1 0 0 0 0\nlfemur 10\n2\nroot 0 1 0 0 0 0\nlfemur 20\n"
+
+
+def test_all_fifty_clips_load_and_have_the_protocols_frames(data_dir):
+    actions = read_protocol(data_dir / "mocap")
+    assert len(actions) == 50
+    counts = {s: [a for a in actions if a.split == s] for s in ("train", "test", "extra")}
+    assert [len(counts[s]) for s in ("train", "test", "extra")] == [22, 12, 16]
+    assert sum(a.frames for a in counts["train"]) == 3217
+    assert sum(a.frames for a in counts["test"]) == 1620
+    for action in actions:
+        motion = load_action(data_dir / "mocap", action)
+        assert motion.num_frames == action.frames and motion.fps == 30.0
+        assert np.isfinite(np.asarray(motion.rotations)).all()
+
+
+@pytest.mark.parametrize(
+    "name", ["amc/002_04.amc", "mb/005_03.bvh", "daz/135_04.bvh", "max/jumping_jacks.bvh"]
+)
+def test_retargeted_limbs_point_where_the_sources_do(data_dir, body, rest, name):
+    path = data_dir / "mocap" / name
+    source = read_bvh(path) if path.suffix == ".bvh" else read_amc(path)
+    motion = retarget(source)
+    _, joints = find_joint_map(source)
+    positions = source.positions()[len(source.root) - motion.num_frames :]
+    world, shift = clip_transforms(body, rest, motion)
+    heads = np.asarray(body.joint_positions(rest)[0])
+    ours = np.einsum("fjab,jb->fja", world, heads) + shift
+    for a, b in LIMBS.items():
+        theirs = (
+            positions[:, source.names.index(joints[b])]
+            - positions[:, source.names.index(joints[a])]
+        )
+        mine = ours[:, body.joint(b)] - ours[:, body.joint(a)]
+        cosine = np.einsum("ij,ij->i", theirs, mine)
+        cosine /= np.linalg.norm(theirs, axis=1) * np.linalg.norm(mine, axis=1)
+        assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 2.0
+
+
+def test_one_trial_as_amc_and_bvh_gives_one_pose(data_dir):
+    a = load_motion(data_dir / "mocap/amc/005_11.amc")
+    b = load_motion(data_dir / "mocap/mb/005_11.bvh")
+    # The BVH dropped its T-pose frame; both then start with the same frame.
+    n = min(a.num_frames, b.num_frames)
+    q, p = (np.asarray(m.rotations)[:n] for m in (a, b))
+    limbs = [0, *range(4, 9), 10, 13, 15, 18, 21, 22]
+    gap = np.degrees(2 * np.arccos(np.clip(np.abs((q * p).sum(axis=2)), 0, 1)))[:, limbs]
+    assert gap.max() < 2.0
+    assert np.abs(np.asarray(a.root)[:n] - np.asarray(b.root)[:n]).max() < 0.02
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["amc/002_05.amc", "amc/002_06.amc", "mb/005_12.bvh", "amc/002_09.amc", "max/131_01.bvh"],
+)
+def test_feet_stay_near_the_floor_on_standing_clips(data_dir, body, rest, name):
+    height = foot_heights(body, load_motion(data_dir / "mocap" / name, fps=30.0), rest)
+    assert height.min() == pytest.approx(0.0, abs=2e-3) and height.max() < 0.06
+
+
+def test_true_rates_come_from_the_table_where_headers_lie(data_dir):
+    with (data_dir / "mocap/CLIPS.csv").open() as file:
+        rates = {r["file"]: float(r["fps"]) for r in csv.DictReader(file)}
+    assert rates["daz/060_12.bvh"] == 60.0
+    assert load_motion(data_dir / "mocap/daz/060_12.bvh").fps == 120.0
+    assert load_motion(data_dir / "mocap/daz/060_12.bvh", source_fps=60.0).fps == 60.0
+
+
+def test_a_small_bvh_is_read_exactly(tmp_path):
+    path = tmp_path / "a.bvh"
+    path.write_text(BVH)
+    clip = read_bvh(path)
+    assert clip.names == ("Hips", "Knee") and clip.fps == 120
+    np.testing.assert_allclose(clip.root, [[0, 1, 0], [0, 1, 0]])
+    expected = Rotation.from_euler("ZYX", [0, 0, 90], degrees=True)
+    np.testing.assert_allclose(clip.rotations[1, 0], expected.as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(clip.positions()[1, 1], [0, 1, -1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "line", "says"),
+    [
+        (lambda s: "", None, "empty"),
+        (lambda s: "\0\1\2" + s, None, "binary"),
+        (lambda s: s.replace("HIERARCHY", "HELLO"), 1, "HIERARCHY"),
+        (lambda s: s[: s.index("MOTION")], 15, "truncated"),
+        (lambda s: s.rsplit("\n", 2)[0] + "\n", 19, "truncated"),
+        (lambda s: s.replace("0 1 0 0 0 90 10 0 0", "0 1 0 0 0 90 10 0"), 20, "values"),
+        (lambda s: s.replace("90 10", "nan 10"), 20, "not finite"),
+        (lambda s: s.replace("90 10", "x 10"), 20, "not a number"),
+        (lambda s: s.replace("CHANNELS 3", "CHANNELS 4"), 9, "CHANNELS says"),
+        (
+            lambda s: s.replace(
+                "Zrotation Yrotation Xrotation\n    End", "Wrotation Yrotation Xrotation\n    End"
+            ),
+            9,
+            "unknown",
+        ),
+        (lambda s: s.replace("Frames: 2", "Frames: many"), 17, "number of frames"),
+        (lambda s: s.replace("Frame Time: 0.0083333", "Frame Time: 0"), 18, "positive"),
+        (lambda s: s.replace("    End Site", "    }}\n    End Site"), None, "'}"),
+        (lambda s: s.replace("OFFSET 0 -1 0", "OFFSET 0 -1", 1), 8, "3"),
+    ],
+)
+def test_broken_bvh_files_are_refused_naming_file_line_and_fix(tmp_path, change, line, says):
+    path = tmp_path / "broken.bvh"
+    path.write_text(change(BVH))
+    with pytest.raises(MotionError, match=says) as error:
+        read_bvh(path)
+    text = str(error.value)
+    assert text.startswith(str(path)) and text.count(". ") >= 1
+    if line is not None:
+        assert text.startswith(f"{path}:{line}:")
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda s: "", "empty"),
+        (lambda s: "\0" + s, "binary"),
+        (lambda s: s[: s.rindex("lfemur")], "lacks 'lfemur'"),
+        (lambda s: s.replace("lfemur 20", "lfemur 20 30"), "channels"),
+        (lambda s: s.replace("lfemur 20", "ltail 20"), "unknown bone"),
+        (lambda s: s.replace("lfemur 20", "lfemur inf"), "not finite"),
+        (lambda s: s.replace("lfemur 10\n2", "lfemur 10\nlfemur 11\n2"), "twice"),
+        (lambda s: "root 0 0 0 0 0 0\n", "before the first frame"),
+        (lambda s: ":DEGREES\n", "no frame"),
+    ],
+)
+def test_broken_amc_files_are_refused(tmp_path, change, says):
+    (tmp_path / "01.asf").write_text(ASF)
+    path = tmp_path / "01_02.amc"
+    path.write_text(change(AMC))
+    with pytest.raises(MotionError, match=says) as error:
+        read_amc(path)
+    assert str(path) in str(error.value)
+
+
+def test_an_amc_without_a_skeleton_says_where_it_looked(tmp_path):
+    path = tmp_path / "01_02.amc"
+    path.write_text(AMC)
+    with pytest.raises(MotionError, match=r"01\.asf"):
+        read_amc(path)
+    (tmp_path / "01.asf").write_text(ASF)
+    assert read_amc(path).names == ("root", "lfemur")
+
+
+def test_unknown_joints_and_formats_are_named(tmp_path):
+    path = tmp_path / "a.bvh"
+    path.write_text(BVH)
+    with pytest.raises(MotionError, match="unknown joints"):
+        load_motion(path)
+    with pytest.raises(MotionError, match="built-in clip"):
+        load_motion("wlak")
+    with pytest.raises(MotionError, match="no such file"):
+        load_motion(tmp_path / "none.bvh")
+    (tmp_path / "x.npz").write_bytes(b"PK\3\4 broken")
+    with pytest.raises(MotionError, match="motion archive"):
+        load_motion(tmp_path / "x.npz")
+
+
+def test_resampling_keeps_duration(data_dir):
+    motion = load_motion(data_dir / "mocap/amc/002_04.amc")
+    slow = resample(motion, 24.0)
+    assert abs((slow.num_frames - 1) / 24 - (motion.num_frames - 1) / motion.fps) < 1 / 24

@@ -1,0 +1,95 @@
+"""Interpolation in closed form, built-in clips, checks of arrays."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+from scipy.spatial.transform import Rotation
+
+from physxnet_jax.errors import MotionError
+from physxnet_jax.motion import (
+    CLIPS,
+    body_animation,
+    foot_heights,
+    load_motion,
+    make_motion,
+    resample,
+    save_motion,
+    slerp,
+)
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.tuples(*[st.floats(-3, 3)] * 3),
+    st.floats(0, 1),
+    st.booleans(),
+)
+def test_slerp_takes_the_short_way_at_constant_speed(a, b, t, flip):
+    ra, rb = Rotation.from_rotvec(a), Rotation.from_rotvec(b)
+    qa, qb = ra.as_quat(scalar_first=True), rb.as_quat(scalar_first=True)
+    q = slerp(qa, -qb if flip else qb, np.array([t]))
+    way = (ra.inv() * rb).as_rotvec()
+    if np.linalg.norm(way) > 3.1:
+        return
+    expected = ra * Rotation.from_rotvec(t * way)
+    gap = (expected.inv() * Rotation.from_quat(q, scalar_first=True)).magnitude()
+    assert gap < 1e-3
+
+
+def turning(frames, fps):
+    q = Rotation.from_rotvec(np.outer(np.arange(frames) / fps, [0, 1.5, 0]))
+    rotations = np.zeros((frames, 31, 4))
+    rotations[..., 0] = 1
+    rotations[:, 0] = q.as_quat(scalar_first=True)
+    return make_motion(rotations, np.outer(np.arange(frames) / fps, [1.0, 0, 0]), fps)
+
+
+@pytest.mark.parametrize("fps", [24.0, 30.0, 60.0, 240.0])
+def test_a_uniform_turn_resamples_exactly(fps):
+    out = resample(turning(121, 120.0), fps)
+    assert out.num_frames == int(fps) + 1
+    expected = Rotation.from_rotvec(np.outer(np.arange(out.num_frames) / fps, [0, 1.5, 0]))
+    got = Rotation.from_quat(np.asarray(out.rotations)[:, 0], scalar_first=True)
+    assert (expected.inv() * got).magnitude().max() < 1e-3
+    np.testing.assert_allclose(np.asarray(out.root)[-1], [1, 0, 0], atol=1e-5)
+
+
+@pytest.mark.parametrize("name", list(CLIPS))
+def test_built_in_clips_stand_on_the_floor_and_move_smoothly(name, body, rest):
+    clip = load_motion(name, fps=30.0)
+    assert clip.num_frames == 120
+    height = foot_heights(body, clip, rest)
+    assert height.min() > -1e-3
+    if name == "jump":
+        assert 0.25 < height.max() < 0.45
+    else:
+        assert height.max() < 1e-2
+    vertices = np.asarray(body_animation(body, clip))
+    speed = np.linalg.norm(np.diff(vertices, axis=0), axis=2) * 30
+    assert 0.3 < speed.max() < 12.0
+
+
+def test_round_trip_through_npz(tmp_path):
+    motion = turning(10, 30.0)
+    save_motion(tmp_path / "m.npz", motion)
+    again = load_motion(tmp_path / "m.npz")
+    np.testing.assert_array_equal(np.asarray(again.rotations), np.asarray(motion.rotations))
+    assert again.fps == 30.0 and not list(tmp_path.glob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "says"),
+    [
+        (lambda r, p: (r[..., :3], p, 30.0), "expected"),
+        (lambda r, p: (r, p, 0.0), "positive"),
+        (lambda r, p: (np.where(np.arange(4) == 1, np.nan, r), p, 30.0), "frame 0, joint 0"),
+        (lambda r, p: (0 * r, p, 30.0), "zero quaternion"),
+        (lambda r, p: (r[:0], p[:0], 30.0), "at least one frame"),
+    ],
+)
+def test_bad_arrays_are_refused(spoil, says):
+    r = np.zeros((3, 31, 4))
+    r[..., 0] = 1
+    with pytest.raises(MotionError, match=says):
+        make_motion(*spoil(r, np.zeros((3, 3))))
