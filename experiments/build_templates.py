@@ -2,7 +2,8 @@
 
 Command: python experiments/build_templates.py
 Cost:    one minute.
-Result:  src/physxnet_jax/garment/assets/templates_cc0.npz, the same bytes every time.
+Result:  src/physxnet_jax/garment/assets/templates_cc0.npz, the same bytes with the same
+         library versions.
 """
 
 import pathlib

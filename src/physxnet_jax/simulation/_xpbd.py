@@ -75,7 +75,7 @@ def advance(
     *,
     solver: XPBD,
     fps: float,
-) -> tuple[State, Float[Array, "frames vertices 3 batch"], dict[str, Array]]:
+) -> tuple[State, Float[Array, "later vertices 3 batch"], dict[str, Array]]:
     """Rolls the cloth through frames 1, 2, ... from its state at frame 0.
 
     Velocities come from the corrections of a substep, not from differences of

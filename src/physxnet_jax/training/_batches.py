@@ -202,7 +202,7 @@ def measure_normalisation(
         otherwise squeeze every other motion into a few per cent of the range.
     """
     pick = np.random.default_rng(seed).choice(len(frames), min(samples, len(frames)), False)
-    look = jax.jit(clip_features, static_argnames="family")
+    look = jax.jit(clip_features, static_argnames=("fps", "family"))
     rows = [
         np.abs(
             look(
@@ -210,7 +210,7 @@ def measure_normalisation(
                 surface.weights,
                 frames.rotations[i],
                 frames.translations[i],
-                frames.fps,
+                fps=frames.fps,
                 family="paper",
             )[0]
         )

@@ -181,7 +181,7 @@ def make_step(
         (loss, (g_rest, fake, l1, adv, parts)), grads = jax.value_and_grad(
             generator_loss, has_aux=True
         )(state.generator)
-        updates, g_opt = g_tx.update(grads, state.generator_opt, state.generator)
+        updates, g_opt = _update(g_tx, grads, state.generator_opt, state.generator)
         g_params = optax.apply_updates(state.generator, updates)
         ok = jnp.isfinite(loss)
         g_rest = jax.tree.map(
@@ -216,7 +216,7 @@ def make_step(
             (d_loss, (d_rest, accuracy)), d_grads = jax.value_and_grad(judge_loss, has_aux=True)(
                 state.discriminator
             )
-            d_updates, d_opt = d_tx.update(d_grads, state.discriminator_opt, state.discriminator)
+            d_updates, d_opt = _update(d_tx, d_grads, state.discriminator_opt, state.discriminator)
             d_params = optax.apply_updates(state.discriminator, d_updates)
             fine = jnp.isfinite(d_loss)
             d_rest = jax.tree.map(
@@ -227,3 +227,9 @@ def make_step(
         return new, metrics
 
     return state, step, g_graph
+
+
+def _update(tx: optax.GradientTransformation, grads: Any, state: Any, params: Any) -> Any:
+    # optax raises floats to integer powers, which strict promotion forbids.
+    with jax.numpy_dtype_promotion("standard"):
+        return tx.update(grads, state, params)

@@ -1,0 +1,246 @@
+"""Networks: the fast transposed convolution, shapes, features and their invariances."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from scipy.spatial.transform import Rotation
+
+from physxnet_jax.models import (
+    WINDOW,
+    Discriminator,
+    Generator,
+    ModelConfig,
+    Normalisation,
+    Predictor,
+    clip_features,
+    depth_to_space,
+    dress_frames,
+    make_generator,
+    make_surface,
+    make_wearable,
+    pad_clip,
+    pose_windows,
+    skin_wearable,
+    upsampling_kernel,
+)
+from physxnet_jax.motion import clip_transforms, load_motion
+from physxnet_jax.uv import bind, garment_map_rows, make_atlas
+
+NHWC = ("NHWC", "HWIO", "NHWC")
+
+
+def test_depth_to_space_equals_a_transposed_convolution_with_its_gradients():
+    k = jax.random.normal(jax.random.key(0), (4, 4, 5, 7))
+    x = jax.random.normal(jax.random.key(1), (2, 6, 8, 5))
+
+    def fast(k, x):
+        out = jax.lax.conv_general_dilated(
+            x, upsampling_kernel(k), (1, 1), ((1, 1), (1, 1)), dimension_numbers=NHWC
+        )
+        return depth_to_space(out)
+
+    def textbook(k, x):
+        # Stride 2, padding 1: each input pixel stamps the kernel; as a dilated convolution.
+        return jax.lax.conv_general_dilated(
+            x, k[::-1, ::-1], (1, 1), ((2, 2), (2, 2)), lhs_dilation=(2, 2), dimension_numbers=NHWC
+        )
+
+    np.testing.assert_allclose(np.asarray(fast(k, x)), np.asarray(textbook(k, x)), atol=2e-4)
+    stamp = np.zeros((1, 6, 8, 5), np.float32)
+    stamp[0, 2, 3, 1] = 1.0
+    out = np.asarray(fast(k, jnp.asarray(stamp)))
+    np.testing.assert_allclose(out[0, 3:7, 5:9], np.asarray(k[:, :, 1]), atol=1e-6)
+    target = jax.random.normal(jax.random.key(2), (2, 12, 16, 7))
+    grads = [
+        jax.grad(lambda k, x, f=f: jnp.sum(f(k, x) * target), argnums=(0, 1))(k, x)
+        for f in (fast, textbook)
+    ]
+    for a, b in zip(*grads):
+        np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=2e-3)
+
+
+@pytest.mark.parametrize("size", [(32, 32), (16, 48)])
+def test_generator_gives_the_decoders_asked_for_and_computes_no_other(size):
+    g = Generator(21, ("top", "bottom", "dress"), width=4, rngs=nnx.Rngs(0))
+    g.eval()
+    x = jnp.ones((2, *size, 21))
+    every = g(x, ("top", "bottom", "dress"))
+    one = g(x, ("dress",))
+    assert set(every) == {"top", "bottom", "dress"} and set(one) == {"dress"}
+    assert one["dress"].shape == (2, *size, 3)
+    np.testing.assert_array_equal(np.asarray(one["dress"]), np.asarray(every["dress"]))
+    graph, state = nnx.split(g)
+
+    def flops(names):
+        run = jax.jit(lambda s, x: nnx.merge(graph, s)(x, names))
+        return run.lower(state, x).compile().cost_analysis()["flops"]
+
+    assert flops(("dress",)) < 0.6 * flops(("top", "bottom", "dress"))
+
+
+def test_sizes_that_halvings_do_not_divide_are_refused():
+    g = Generator(18, ("top",), width=2, rngs=nnx.Rngs(0))
+    with pytest.raises(ValueError, match="multiples of 16"):
+        g(jnp.zeros((1, 40, 32, 18)), ("top",))
+
+
+def test_discriminator_judges_patches():
+    d = Discriminator(27, width=4, rngs=nnx.Rngs(0))
+    out = d(jnp.zeros((2, 64, 64, 18)), jnp.zeros((2, 64, 64, 9)))
+    assert out.shape == (2, 8, 8, 1)
+
+
+@pytest.fixture(scope="module")
+def worn(body, rest):
+    from physxnet_jax.garment import template
+
+    atlas = make_atlas(32)
+    garments = [template(t) for t in ("top", "dress")]
+    rows = [garment_map_rows(atlas, body, rest, g) for g in garments]
+    valid = {g.template: r.valid for g, r in zip(garments, rows)}
+    surface = make_surface(atlas, body, rest, valid)
+    wearables = [
+        make_wearable(body, rest, g, bind(atlas, body, rest, g, r.valid))
+        for g, r in zip(garments, rows)
+    ]
+    return atlas, surface, wearables
+
+
+def transforms(body, rest, turn=None):
+    motion = load_motion("punch", fps=30.0)
+    q, p = np.asarray(motion.rotations[:8]).copy(), np.asarray(motion.root[:8]).copy()
+    if turn is not None:
+        first = Rotation.from_quat(q[:, 0], scalar_first=True)
+        q[:, 0] = (turn * first).as_quat(scalar_first=True)
+        p = p @ turn.as_matrix().T.astype(np.float32)
+    from physxnet_jax.motion import make_motion
+
+    world, shift = clip_transforms(body, rest, make_motion(q, p, 30.0))
+    return jnp.asarray(world), jnp.asarray(shift)
+
+
+def test_local_features_do_not_see_a_turn_about_the_vertical_but_paper_ones_do(worn, body, rest):
+    _, surface, _ = worn
+    turn = Rotation.from_euler("Y", 1.1)
+    out = {}
+    for name, t in (("a", None), ("b", turn)):
+        r, s = (pad_clip(x) for x in transforms(body, rest, t))
+        for family in ("local", "paper"):
+            out[name, family] = np.asarray(
+                clip_features(surface.rest, surface.weights, r, s, 30.0, family)
+            )
+    scale = np.abs(out["a", "local"]).max()
+    assert np.abs(out["a", "local"] - out["b", "local"]).max() < 1e-3 * scale
+    assert (
+        np.abs(out["a", "paper"] - out["b", "paper"]).max() > 0.1 * np.abs(out["a", "paper"]).max()
+    )
+    tipped = Rotation.from_euler("X", 0.5)
+    r, s = (pad_clip(x) for x in transforms(body, rest, tipped))
+    tilted = np.asarray(clip_features(surface.rest, surface.weights, r, s, 30.0, "local"))
+    # The velocities are the same, gravity isn't: the network can feel which way is down.
+    assert np.abs(out["a", "local"][..., :9] - tilted[..., :9]).max() < 1e-3 * scale
+    assert np.abs(out["a", "local"][..., 18:] - tilted[..., 18:]).max() > 0.2
+
+
+def test_features_of_a_window_equal_features_of_the_clip(worn, body, rest):
+    _, surface, _ = worn
+    world, shift = transforms(body, rest)
+    clip = clip_features(
+        surface.rest, surface.weights, pad_clip(world), pad_clip(shift), 30.0, "local"
+    )
+    windows = [pose_windows(x) for x in (world, shift)]
+    assert windows[0].shape[1] == WINDOW
+    each = jnp.stack(
+        [
+            clip_features(surface.rest, surface.weights, r, s, 30.0, "local")[0]
+            for r, s in zip(*windows)
+        ]
+    )
+    np.testing.assert_allclose(np.asarray(clip), np.asarray(each), atol=2e-2)
+
+
+def test_speed_is_in_metres_a_second_at_any_frame_rate(worn, body, rest):
+    _, surface, _ = worn
+    fast = load_motion("walk", fps=60.0)
+    slow = load_motion("walk", fps=30.0)
+    speeds = []
+    for m, k in ((fast, 60), (slow, 30)):
+        world, shift = clip_transforms(body, rest, m)
+        f = clip_features(
+            surface.rest,
+            surface.weights,
+            jnp.asarray(world[k - 4 : k + 1]),
+            jnp.asarray(shift[k - 4 : k + 1]),
+            m.fps,
+            "paper",
+        )
+        speeds.append(np.linalg.norm(np.asarray(f[0, :, 6:9]), axis=1).mean())
+    assert speeds[0] == pytest.approx(speeds[1], rel=0.15)
+
+
+def predictor(worn, family, zero=False):
+    atlas, surface, _ = worn
+    config = ModelConfig(family=family, resolution=32, width=4, templates=("top", "dress"))
+    network = make_generator(config)
+    network.eval()
+    graph, state = nnx.split(network)
+    if zero:
+        state = jax.tree.map(jnp.zeros_like, state)
+    scales = {t: jnp.float32(0.1) for t in config.templates}
+    return Predictor(
+        atlas,
+        surface,
+        Normalisation(jnp.float32(3.0), jnp.float32(60.0), scales),
+        state,
+        graph,
+        config,
+    )
+
+
+def test_zero_output_of_the_local_family_is_exactly_skinning(worn, body, rest):
+    _, _, wearables = worn
+    r, s = transforms(body, rest)
+    out = dress_frames(
+        predictor(worn, "local", zero=True), wearables, pad_clip(r), pad_clip(s), 30.0
+    )
+    for w, x in zip(wearables, out):
+        skinned = jax.vmap(lambda a, b, w=w: skin_wearable(w, a, b))(r, s)
+        np.testing.assert_array_equal(np.asarray(x), np.asarray(skinned))
+
+
+def test_turning_the_person_turns_the_answer(worn, body, rest):
+    _, _, wearables = worn
+    turn = Rotation.from_euler("Y", 0.8)
+    p = predictor(worn, "local")
+    runs = [
+        dress_frames(p, wearables, *(pad_clip(x) for x in transforms(body, rest, t)), 30.0)
+        for t in (None, turn)
+    ]
+    for a, b in zip(*runs):
+        np.testing.assert_allclose(np.asarray(a) @ turn.as_matrix().T, np.asarray(b), atol=2e-4)
+
+
+@pytest.mark.parametrize("family", ["local", "paper"])
+def test_dressing_is_differentiable_in_the_pose(worn, body, rest, family):
+    _, _, wearables = worn
+    p = predictor(worn, family)
+    motion = load_motion("walk", fps=30.0)
+    poses, root = motion.rotations[20:25], motion.root[20:25]
+    bend = body.joint("LeftArm")
+
+    def height(angle):
+        half = 0.5 * angle
+        turn = jnp.stack([jnp.cos(half), jnp.zeros(()), jnp.zeros(()), jnp.sin(half)])
+        from physxnet_jax.geometry import quaternion_multiply
+
+        last = poses[-1].at[bend].set(quaternion_multiply(turn, poses[-1, bend]))
+        q = jnp.concatenate([poses[:-1], last[None]])
+        world, shift = jax.vmap(lambda a, b: body.transforms(rest, a, b))(q, root)
+        return sum(x[..., 1].mean() for x in dress_frames(p, wearables, world, shift, 30.0))
+
+    slope = jax.grad(height)(jnp.float32(0.1))
+    step = 2e-2
+    difference = (height(jnp.float32(0.1 + step)) - height(jnp.float32(0.1 - step))) / (2 * step)
+    assert float(slope) == pytest.approx(float(difference), rel=0.1, abs=2e-3)

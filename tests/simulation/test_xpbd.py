@@ -1,0 +1,276 @@
+"""The simulator in closed form: free fall, pendulum, stillness, order, absent effects."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.body import load_body
+from physxnet_jax.errors import SimulationError
+from physxnet_jax.garment import COTTON, Garment, template
+from physxnet_jax.geometry import make_mesh, mesh_edges
+from physxnet_jax.motion import load_motion
+from physxnet_jax.simulation import (
+    XPBD,
+    Bend,
+    BodyContact,
+    Damping,
+    Gravity,
+    Pin,
+    Scene,
+    State,
+    Stretch,
+    advance,
+    lead_in,
+    prepare_scene,
+    simulate,
+)
+
+FPS = 30.0
+
+
+def sheet(n=6, size=0.3, pinned=None, height=0.0):
+    """A square sheet in the air in front of the body, as a garment."""
+    x, y = np.meshgrid(np.linspace(0, size, n), np.linspace(0, size, n))
+    v = np.column_stack([x.ravel(), height + 0 * x.ravel(), 1.5 + y.ravel()])
+    k = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (q.ravel() for q in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
+    # Rows of the grid run along z: this order makes normals point up.
+    f = np.concatenate([np.column_stack([a, c, b]), np.column_stack([a, d, c])])
+    body = load_body()
+    held = np.zeros(n * n, bool)
+    if pinned is not None:
+        held[pinned] = True
+    skin = np.zeros((n * n, 31), np.float32)
+    skin[:, 0] = 1
+    refs = jnp.zeros((n * n, 1), jnp.int32)
+    first = np.asarray(body.rest_vertices(body.default_shape()))[0]
+    return Garment(
+        make_mesh(v, f),
+        jnp.asarray(held),
+        refs,
+        jnp.ones((n * n, 1), jnp.float32),
+        jnp.asarray((v - first).astype(np.float32)),
+        jnp.asarray(skin),
+        COTTON,
+        "top",
+        "sheet",
+    )
+
+
+def still(frames):
+    body = load_body()
+    rest = body.rest_vertices(body.default_shape())
+    pose = jnp.repeat(body.a_pose()[None, None], frames + 1, axis=0)
+    root = jnp.repeat(body.joint_positions(rest)[0][:1][None], frames + 1, axis=0)
+    return body, rest, pose, root
+
+
+def roll(garment, effects, frames, solver=None, start=None, shift=None):
+    """Positions of every frame, with the body standing still."""
+    scene = prepare_scene(Scene((garment,), effects))
+    body, rest, pose, root = still(frames)
+    if shift is not None:
+        root = root + shift[None]
+    x = jnp.asarray(scene.assembly.rest.astype(np.float32)) if start is None else start
+    if shift is not None:
+        x = x + shift
+    state = State(x[:, :, None], jnp.zeros((*x.shape, 1)))
+    state, moved, info = advance(
+        body, rest, scene.effects, state, pose, root, solver=solver or XPBD(16, 2), fps=FPS
+    )
+    return np.asarray(moved)[..., 0], {k: np.asarray(v)[:, 0] for k, v in info.items()}
+
+
+def test_free_fall_is_exact_to_the_order_of_the_step():
+    g = sheet()
+    moved, info = roll(g, (Gravity(), Stretch(), Bend()), 15, XPBD(32, 4))
+    t = 15 / FPS
+    fallen = np.asarray(g.mesh.vertices)[:, 1] - moved[-1, :, 1]
+    # Symplectic Euler falls g h t / 2 farther than the parabola.
+    exact = 0.5 * 9.81 * t**2 + 0.5 * 9.81 * t / (FPS * 32)
+    np.testing.assert_allclose(fallen, exact, rtol=1e-4)
+    assert info["finite"].all() and info["speed_max"][-1] == pytest.approx(9.81 * t, rel=1e-4)
+
+
+def test_without_gravity_a_sheet_at_rest_stays_bitwise_at_rest():
+    g = sheet()
+    moved, _ = roll(g, (Stretch(), Bend()), 3)
+    assert np.abs(moved[-1] - np.asarray(g.mesh.vertices)).max() < 1e-6
+
+
+def test_a_pinned_sheet_swings_like_a_pendulum_and_keeps_its_size():
+    n = 6
+    g = sheet(n, pinned=np.arange(n))
+    moved, info = roll(g, (Gravity(), Stretch(), Bend(), Pin()), 45, XPBD(64, 2))
+    np.testing.assert_allclose(moved[-1][:n], np.asarray(g.mesh.vertices)[:n], atol=1e-6)
+    assert info["strain_max"].max() < 0.05
+    # A uniform rod of length L falls to the vertical in 1.854 sqrt(2 L / 3 g) from level.
+    quarter = 1.8541 * np.sqrt(2 * 0.3 / (3 * 9.81))
+    angle = np.arctan2(moved[:, -n:, 2].mean(1) - 1.5, -moved[:, -n:, 1].mean(1))
+    crossing = np.argmax(angle < 0) / FPS
+    assert crossing == pytest.approx(quarter, rel=0.12)
+
+
+def test_energy_never_grows_from_a_stretched_start():
+    g = sheet()
+    start = jnp.asarray(np.asarray(g.mesh.vertices)) * jnp.array([[1.2, 1.0, 1.0]])
+    _, info = roll(g, (Stretch(), Bend()), 30, start=start)
+    speed = info["speed_max"]
+    assert np.isfinite(speed).all() and speed.max() < 30
+    assert info["strain_max"][-1] < 0.3
+
+
+def test_halving_the_step_halves_the_error():
+    g = sheet(5, pinned=np.arange(5))
+    effects = (Gravity(), Stretch(), Bend(), Pin())
+    # The differences of successive refinements fall by two for a first-order method.
+    runs = [roll(g, effects, 4, XPBD(n, 1))[0][-1] for n in (32, 64, 128, 256)]
+    gaps = [np.sqrt(np.mean((a - b) ** 2)) for a, b in zip(runs, runs[1:])]
+    orders = np.log2(np.asarray(gaps[:-1]) / np.asarray(gaps[1:]))
+    assert orders.mean() == pytest.approx(1.0, abs=0.35), orders
+
+
+def test_small_steps_do_not_lose_to_float32():
+    """The textbook form gets worse beyond 128 substeps; the compensated one does not."""
+    g = sheet(5, pinned=np.arange(5))
+    effects = (Gravity(), Stretch(), Bend(), Pin())
+    runs = {n: roll(g, effects, 4, XPBD(n, 8))[0][-1] for n in (128, 256, 512, 1024)}
+    error = {n: np.sqrt(np.mean((runs[n] - runs[1024]) ** 2)) for n in (128, 256, 512)}
+    assert error[256] <= 1.05 * error[128] and error[512] <= 1.05 * error[256]
+
+
+def test_far_from_the_origin_nothing_changes_beyond_rounding():
+    g = sheet(5)
+    effects = (Gravity(), Stretch(), Bend())
+    here = roll(g, effects, 10)[0][-1]
+    shift = jnp.array([[100.0, 0.0, -50.0]])
+    there = roll(g, effects, 10, shift=shift)[0][-1] - np.asarray(shift)
+    assert np.abs(here - there).max() < 4 * np.spacing(np.float32(100.0)) * 10
+
+
+@pytest.mark.parametrize("effect", [Stretch(), Bend(), Gravity(), Damping(), Pin()])
+def test_an_absent_effect_leaves_no_trace(effect):
+    """Neither body nor effect is in the program of a scene that doesn't call for them."""
+    g = sheet(4)
+    scene = prepare_scene(Scene((g,), (effect,)))
+    body, rest, pose, root = still(1)
+    x = jnp.asarray(scene.assembly.rest.astype(np.float32))[:, :, None]
+
+    def program(effects):
+        return str(
+            jax.make_jaxpr(
+                lambda s: advance(body, rest, effects, s, pose, root, solver=XPBD(4, 1), fps=FPS)
+            )(State(x, jnp.zeros_like(x)))
+        )
+
+    with_it, without = program(scene.effects), program(())
+    assert len(with_it) > len(without)
+    assert "gather" not in without and "scatter" not in without
+    if not isinstance(effect, Pin):
+        assert "einsum" not in with_it and "dot_general" not in with_it, "the body was skinned"
+
+
+def test_an_effect_that_touches_nothing_changes_no_bit():
+    """The sheet falls half a metre in front of the body: contact must not be felt."""
+    g = sheet(4)
+    plain = roll(g, (Gravity(), Stretch(), Bend()), 5)[0]
+    contact = roll(g, (Gravity(), Stretch(), Bend(), BodyContact()), 5)[0]
+    np.testing.assert_array_equal(plain, contact)
+
+
+def test_contact_keeps_cloth_on_the_shoulders_and_its_absence_lets_it_through():
+    g = template("top")
+    motion = load_motion("stretch", fps=FPS)
+    short = dataclasses.replace(motion, rotations=motion.rotations[:10], root=motion.root[:10])
+    worn = simulate(Scene((g,)), short)
+    assert worn.finite.all()
+    assert worn.diagnostics["inside_share"].max() < 0.02
+    assert worn.diagnostics["speed_max"].max() < 12.0
+    fallen = simulate(Scene((g,), (Gravity(), Stretch(), Bend())), short)
+    assert worn.positions[0][-1, :, 1].mean() - fallen.positions[0][-1, :, 1].mean() > 0.5
+
+
+def test_batches_agree_with_single_runs():
+    from physxnet_jax.simulation import simulate_batch
+
+    g = template("bottom")
+    a, b = load_motion("walk", fps=FPS), load_motion("spin", fps=FPS)
+    cut = [
+        dataclasses.replace(m, rotations=m.rotations[:n], root=m.root[:n])
+        for m, n in ((a, 6), (b, 4))
+    ]
+    scene = prepare_scene(Scene((g,)))
+    solver = XPBD(8, 1)
+    both = simulate_batch(scene, cut, solver=solver)
+    for one, m in zip(both, cut):
+        alone = simulate_batch(scene, [m], solver=solver)[0]
+        assert one.positions[0].shape == (m.num_frames, g.num_vertices, 3)
+        assert np.abs(one.positions[0] - alone.positions[0]).max() < 5e-3
+
+
+def test_gradients_through_the_simulation_are_finite_and_right():
+    g = sheet(4, pinned=np.arange(4))
+    scene = prepare_scene(Scene((g,), (Gravity(), Stretch(), Bend(), Pin())))
+    body, rest, pose, root = still(2)
+    x = jnp.asarray(scene.assembly.rest.astype(np.float32))[:, :, None]
+
+    def height(lift):
+        state = State(x, jnp.zeros_like(x).at[:, 1].set(lift))
+        _, moved, _ = advance(
+            body, rest, scene.effects, state, pose, root, solver=XPBD(8, 1), fps=FPS
+        )
+        return moved[-1, :, 1].mean()
+
+    slope = jax.grad(height)(jnp.float32(0.2))
+    step = 1e-2
+    difference = (height(jnp.float32(0.2 + step)) - height(jnp.float32(0.2 - step))) / (2 * step)
+    assert float(slope) == pytest.approx(float(difference), rel=0.02)
+
+
+def test_degenerate_cloth_stays_finite():
+    """Duplicate vertices, a triangle without area, an isolated vertex."""
+    v = [[0, 0, 1.5], [0.1, 0, 1.5], [0, 0, 1.6], [0, 0, 1.5], [0.3, 0.3, 1.5], [0.05, 0, 1.5]]
+    g = sheet(4)
+    mesh = make_mesh(v, [[0, 1, 2], [0, 3, 1], [0, 5, 1]])
+    n = len(v)
+    first = np.asarray(load_body().rest_vertices(load_body().default_shape()))[0]
+    bad = dataclasses.replace(
+        g,
+        mesh=mesh,
+        pinned=jnp.zeros((n,), bool),
+        refs=jnp.zeros((n, 1), jnp.int32),
+        ref_weights=jnp.ones((n, 1)),
+        offset=jnp.asarray(np.asarray(v, np.float32) - first),
+        skin=g.skin[:n],
+    )
+    moved, info = roll(bad, (Gravity(), Stretch(), Bend()), 10)
+    assert info["finite"].all()
+    assert np.abs(moved[-1] - np.asarray(v)).max() < 1.0
+    # The negative control: a healthy triangle keeps its edges to a per cent.
+    edges = mesh_edges(np.asarray([[0, 1, 2]])).vertices
+    length = np.linalg.norm(moved[-1][edges[:, 0]] - moved[-1][edges[:, 1]], axis=1)
+    rest = np.linalg.norm(np.asarray(v)[edges[:, 0]] - np.asarray(v)[edges[:, 1]], axis=1)
+    np.testing.assert_allclose(length, rest, rtol=0.05)
+
+
+def test_scenes_and_solvers_refuse_nonsense():
+    with pytest.raises(SimulationError, match="needs a garment"):
+        prepare_scene(Scene(()))
+    with pytest.raises(SimulationError, match="twice"):
+        prepare_scene(Scene((sheet(),), (Gravity(), Gravity(g=1.0))))
+    with pytest.raises(ValueError, match="multiple"):
+        XPBD(substeps=10, queries=4)
+
+
+def test_the_lead_in_ends_in_the_first_frame_and_starts_at_rest(body):
+    motion = load_motion("punch", fps=FPS)
+    lead = lead_in(body, motion)
+    assert lead.num_frames == 45
+    q = np.asarray(lead.rotations)
+    dot = np.abs((q[-1] * np.asarray(motion.rotations[0])).sum(axis=1))
+    np.testing.assert_allclose(dot, 1.0, atol=1e-5)
+    step = 2 * np.arccos(np.clip(np.abs((q[1:] * q[:-1]).sum(axis=2)), 0, 1))
+    assert np.degrees(step).max() < 15

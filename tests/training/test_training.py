@@ -1,0 +1,128 @@
+"""Losses in closed form; a run that is stopped and resumed is the same run."""
+
+import dataclasses
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.data import Sequence
+from physxnet_jax.errors import FormatError, PhysXNetError
+from physxnet_jax.garment import template
+from physxnet_jax.models import ModelConfig
+from physxnet_jax.motion import load_motion
+from physxnet_jax.training import (
+    TrainConfig,
+    adversarial_loss,
+    batch_indices,
+    discriminator_loss,
+    masked_l1,
+    soft_labels,
+    train,
+)
+
+CONFIG = TrainConfig(
+    model=ModelConfig(resolution=32, width=4, templates=("bottom", "top")),
+    epochs=8,
+    batch=4,
+    learning_rate=2e-3,
+    discriminator_width=4,
+    checkpoint_every=1000,
+)
+META = {"finite": True, "worst": {"penetration_max": 0.0}}
+
+
+def sequence(name="walk", frames=20, seed=0, ok=True):
+    motion = load_motion(name, fps=30.0)
+    motion = dataclasses.replace(
+        motion, rotations=motion.rotations[:frames], root=motion.root[:frames]
+    )
+    rng = np.random.default_rng(seed)
+    offsets = {}
+    for t in ("top", "bottom"):
+        base = 0.02 * np.asarray(template(t).mesh.vertices)
+        offsets[t] = (base[None] + rng.normal(0, 1e-3, (frames, 1, 3))).astype(np.float32)
+    meta = {t: {**META, "finite": ok} for t in offsets}
+    return Sequence(name, "train", motion, offsets, meta)
+
+
+def test_soft_labels_lie_where_the_paper_puts_them():
+    for real, low, high in ((True, 0.7, 1.0), (False, 0.0, 0.3)):
+        labels = np.asarray(soft_labels(jax.random.key(1), (20_000,), real=real))
+        inside = (labels >= low) & (labels <= high)
+        assert inside.mean() == pytest.approx(0.95, abs=0.01)
+        flipped = labels[~inside]
+        assert ((flipped >= 0.7) if not real else (flipped <= 0.3)).all()
+
+
+def test_losses_in_closed_form():
+    zeros = jnp.zeros((3, 4))
+    assert float(discriminator_loss(zeros, zeros, zeros + 1, zeros)) == pytest.approx(2 * np.log(2))
+    assert float(adversarial_loss(zeros)) == pytest.approx(np.log(2))
+    big = jnp.full((2,), 1e4)
+    assert float(adversarial_loss(big)) == 0.0
+    assert np.isfinite(float(discriminator_loss(-big, big, big * 0 + 1, big * 0)))
+    predicted = jnp.ones((2, 3, 3))
+    target = jnp.zeros((2, 3, 3)).at[1].set(5.0)
+    valid = jnp.array([True, True, False])
+    one = masked_l1(predicted, target, valid, jnp.array([1.0, 0.0]))
+    both = masked_l1(predicted, target, valid, jnp.array([1.0, 1.0]))
+    none = masked_l1(predicted, target, valid, jnp.zeros((2,)))
+    assert (float(one), float(both), float(none)) == (1.0, 2.5, 0.0)
+    # What the mask hides has no influence.
+    hidden = masked_l1(predicted.at[:, 2].set(99.0), target, valid, jnp.array([1.0, 0.0]))
+    assert float(hidden) == 1.0
+
+
+def test_batches_are_permutations_that_the_step_alone_decides():
+    seen = np.concatenate([batch_indices(40, 8, 3, step) for step in range(5)])
+    assert sorted(seen) == list(range(40))
+    np.testing.assert_array_equal(batch_indices(40, 8, 3, 7), batch_indices(40, 8, 3, 7))
+    assert not np.array_equal(batch_indices(40, 8, 3, 0), batch_indices(40, 8, 3, 5))
+
+
+def test_twenty_steps_are_ten_and_ten_bitwise(tmp_path):
+    data = [sequence()]
+    whole = train(CONFIG, data, tmp_path / "whole", steps=20)
+    train(CONFIG, data, tmp_path / "parts", steps=10)
+    parts = train(CONFIG, data, tmp_path / "parts", steps=20)
+    for a, b in zip(jax.tree.leaves(whole.state), jax.tree.leaves(parts.state)):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    log = [json.loads(x) for x in (tmp_path / "whole" / "metrics.jsonl").read_text().splitlines()]
+    assert log[-1]["step"] == 20 and log[-1]["skipped"] == 0
+    with pytest.raises(PhysXNetError, match="learning_rate"):
+        train(dataclasses.replace(CONFIG, learning_rate=1.0), data, tmp_path / "whole", steps=30)
+
+
+def test_a_short_run_learns_and_both_players_stay_in_their_band(tmp_path):
+    config = dataclasses.replace(CONFIG, epochs=30)
+    values = []
+    train(config, [sequence()], tmp_path, steps=120, report=lambda a, b, m: values.append(m))
+    assert values[-1]["l1"] < 0.5 * values[0]["l1"]
+    assert 0.2 < values[-1]["discriminator"] < 2.5 and values[-1]["adversarial"] < 4.0
+
+
+def test_nan_data_is_refused_by_count_and_never_enters_the_weights(tmp_path):
+    bad = sequence()
+    spoiled = dataclasses.replace(bad.motion, root=bad.motion.root.at[:].set(jnp.nan))
+    config = dataclasses.replace(CONFIG, max_skipped=3)
+    with pytest.raises(PhysXNetError, match="not finite"):
+        train(config, [dataclasses.replace(bad, motion=spoiled)], tmp_path, steps=40)
+
+
+def test_cloth_that_came_off_is_left_out(tmp_path):
+    with pytest.raises(FormatError, match="no usable sequence"):
+        train(CONFIG, [sequence(ok=False)], tmp_path, steps=2)
+    with pytest.raises(FormatError, match="build a dataset"):
+        train(CONFIG, [], tmp_path, steps=2)
+
+
+def test_the_paper_family_trains_as_well(tmp_path):
+    config = dataclasses.replace(
+        CONFIG, model=dataclasses.replace(CONFIG.model, family="paper"), adversarial=False
+    )
+    values = []
+    train(config, [sequence()], tmp_path, steps=40, report=lambda a, b, m: values.append(m))
+    assert values[-1]["l1"] < values[0]["l1"]
