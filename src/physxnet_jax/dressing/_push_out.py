@@ -6,11 +6,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body
-from ..geometry import TriMesh, closest_among, nearby_faces, safe_normalize, vertex_normals
+from ..geometry import TriMesh, closest_among, safe_normalize, vertex_normals
 from ..models import Wearable, skin_points
 from ..typing import pytree
+
+# Triangles compared for each vertex: a patch of about five centimetres.
+_PATCH = 20
 
 
 @pytree
@@ -37,7 +41,8 @@ def make_patch(body: Body, rest: Float[Array, "all 3"], wearable: Wearable) -> S
     """Triangles round the skin point nearest to each vertex at rest."""
     mesh = body.mesh(rest[:NUM_BODY_VERTICES])
     faces = np.asarray(mesh.faces)
-    near = nearby_faces(np.asarray(mesh.vertices), faces, np.asarray(wearable.rest), neighbours=8)
+    middles = np.asarray(mesh.vertices)[faces].mean(axis=1)
+    near = KDTree(middles).query(np.asarray(wearable.rest), k=_PATCH)[1]
     used_faces, local_faces = np.unique(near, return_inverse=True)
     rows, corners = np.unique(faces[used_faces], return_inverse=True)
     pick = jnp.asarray(rows)

@@ -40,20 +40,9 @@ class _Stage:
 
         self.plotter = _plotter(size)
         self.meshes = meshes
-        self.surfaces = []
         everything = np.concatenate([m.positions[0] for m in meshes])
         self.floor = float(min(m.positions[..., 1].min() for m in meshes))
         self.height = float(np.ptp(everything[:, 1]))
-        for m in meshes:
-            surface = pyvista.PolyData.from_regular_faces(m.positions[0].copy(), m.faces)
-            self.surfaces.append(surface)
-            self.plotter.add_mesh(
-                surface,
-                color=m.colour,
-                smooth_shading=True,
-                specular=0.1,
-                backface_params={"color": tuple(0.6 * c for c in m.colour)},
-            )
         path = np.concatenate([m.positions.mean(axis=1) for m in meshes[:1]])
         middle, reach = path.mean(axis=0), 2.5 + np.ptp(path, axis=0).max()
         ground = pyvista.Plane(
@@ -68,15 +57,19 @@ class _Stage:
 
     def shoot(self, frame: int) -> np.ndarray:
         """One frame as an RGB image."""
+        import pyvista
+
         centre = self.meshes[0].positions[frame].mean(axis=0)
-        for m, surface in zip(self.meshes, self.surfaces, strict=True):
-            surface.points = m.positions[frame].copy()
-            surface.compute_normals(
-                inplace=True,
-                cell_normals=False,
-                split_vertices=False,
-                consistent_normals=False,
-                auto_orient_normals=False,
+        for k, m in enumerate(self.meshes):
+            # Named meshes replace the last frame's; smooth shading needs new normals anyway.
+            self.plotter.add_mesh(
+                pyvista.PolyData.from_regular_faces(m.positions[frame].copy(), m.faces),
+                name=f"mesh{k}",
+                color=m.colour,
+                smooth_shading=True,
+                specular=0.1,
+                reset_camera=False,
+                backface_params={"color": tuple(0.6 * c for c in m.colour)},
             )
         target = np.array([centre[0], self.floor + 0.9, centre[2]])
         eye = target + np.array([1.3, 0.5, 3.4])

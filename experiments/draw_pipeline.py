@@ -1,0 +1,59 @@
+"""Draws docs/pipeline.png and docs/demo.png: maps in, maps out, mesh dressed.
+
+Command: python experiments/draw_pipeline.py
+Cost:    one minute.
+Result:  one frame of the built-in punch: velocity, acceleration, gravity and offset maps
+         beside the dressed body; and six moments of the built-in walk.
+"""
+
+import pathlib
+
+import imageio.v3 as iio
+import jax.numpy as jnp
+import numpy as np
+
+import physxnet_jax as px
+from physxnet_jax.dressing import dress
+from physxnet_jax.models import clip_features
+from physxnet_jax.motion import clip_transforms, load_motion
+from physxnet_jax.viewer import render_frame, render_preview
+
+FRAME = 9
+SIZE = 288
+
+
+def picture(values: np.ndarray, texels: np.ndarray, size: int) -> np.ndarray:
+    """A map of three channels as a picture: zero is grey, empty texels are white."""
+    scale = np.quantile(np.abs(values), 0.98)
+    flat = np.full((size * size, 3), 255, np.uint8)
+    flat[texels] = (127 + 120 * np.clip(values / scale, -1, 1)).astype(np.uint8)
+    image = flat.reshape(size, size, 3)
+    pick = np.arange(SIZE) * size // SIZE
+    return image[pick][:, pick]
+
+
+def main() -> None:
+    body = px.load_body()
+    rest = body.rest_vertices(body.default_shape())
+    predictor = px.load_predictor()
+    size = predictor.config.resolution
+    motion = load_motion("punch", fps=30.0)
+    world, shift = (jnp.asarray(x[FRAME - 4 : FRAME + 1]) for x in clip_transforms(body, rest, motion))
+    surface = predictor.surface
+    inputs = np.asarray(clip_features(surface.rest, surface.weights, world, shift, 30.0, "local"))[0]
+    outputs = predictor(world, shift, 30.0, predictor.config.templates)
+    texels = np.asarray(predictor.atlas.texels)
+    shown = [inputs[:, 6:9], inputs[:, 15:18], inputs[:, 18:21]]
+    shown += [np.asarray(outputs[t][0]) for t in predictor.config.templates]
+    pictures = [picture(x, texels, size) for x in shown]
+    maps = np.concatenate([np.concatenate(pictures[:3], 1), np.concatenate(pictures[3:], 1)])
+    clip = dress(motion, ["top", "bottom"], frames=FRAME + 1)
+    mesh = render_frame(clip.meshes, FRAME, size=(512, 2 * SIZE))
+    pathlib.Path("docs").mkdir(exist_ok=True)
+    iio.imwrite("docs/pipeline.png", np.concatenate([maps, mesh], axis=1))
+    walk = dress("walk", ["top", "bottom"], frames=48)
+    render_preview("docs/demo.png", walk.meshes, walk.fps, size=(240, 416))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,92 @@
+"""The command: what it writes, what it prints, how it fails."""
+
+import numpy as np
+import pytest
+
+from physxnet_jax._environment import check_jaxlib, jaxlib_problem
+from physxnet_jax.cli import main
+from physxnet_jax.errors import BrokenInstallError
+
+
+def test_doctor_and_clips_print_what_there_is(capsys):
+    assert main(["doctor"]) == 0
+    out = capsys.readouterr().out
+    assert "jaxlib" in out and "cpu" in out
+    assert main(["clips"]) == 0
+    assert "side step" in capsys.readouterr().out
+
+
+def test_a_jaxlib_that_miscomputes_is_refused(monkeypatch, capsys):
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "0.10.2")
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    with pytest.raises(BrokenInstallError, match="wrong numbers"):
+        check_jaxlib()
+    assert main(["doctor"]) == 1
+    assert "Install another" in capsys.readouterr().out
+    assert jaxlib_problem("0.10.2", "--xla_cpu_experimental_ynn_fusion_type=") is None
+    assert jaxlib_problem("0.10.1") is None and jaxlib_problem("0.11.0") is not None
+
+
+@pytest.mark.parametrize("method", ["network", "lbs"])
+def test_dress_writes_and_reports(tmp_path, capsys, method):
+    out = tmp_path / "a.npz"
+    words = [
+        "dress",
+        "walk",
+        "--wear",
+        "top",
+        "bottom",
+        "-o",
+        str(out),
+        "--frames",
+        "20",
+        "--method",
+        method,
+    ]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "20 frames at 30 fps" in text and "inside body" in text
+    with np.load(out) as data:
+        assert data["top_positions"].shape == (20, 3301, 3)
+        assert np.isfinite(data["bottom_positions"]).all()
+        assert data["body_positions"].shape == (20, 13380, 3)
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["dress", "wlak"], "built-in clip"),
+        (["dress", "walk", "--wear", "hat"], "OBJ files"),
+        (["dress", "walk", "-o", "a.abc"], "usdc"),
+        (["dress", "walk", "--preview", "a.avi"], "preview"),
+        (["dress", "walk", "--shape", "tall=1"], "height_up"),
+        (["dress", "walk", "--shape", "gender=nan"], "from 0 to 1"),
+        (["dress", "walk", "--weights", "none"], "first"),
+        (["dress", "walk", "--frames", "0"], "at least one"),
+    ],
+)
+def test_errors_are_one_sentence_and_exit_code_two(capsys, words, says):
+    assert main(words) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("physxnet: ") and says in " ".join(error.split())
+    assert "Traceback" not in error
+
+
+def test_other_body_shapes_stand_on_the_floor(tmp_path):
+    out = tmp_path / "a.npz"
+    words = [
+        "dress",
+        "balance",
+        "--wear",
+        "bottom",
+        "--shape",
+        "gender=1",
+        "-o",
+        str(out),
+        "--frames",
+        "4",
+        "--quiet",
+    ]
+    assert main(words) == 0
+    with np.load(out) as data:
+        assert abs(float(data["body_positions"][..., 1].min())) < 0.01

@@ -1,0 +1,74 @@
+"""Dressing: methods agree where they must, and nothing inside the body is left."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.dressing import dress, make_patch, push_out, skin_height, unbound_wearable
+from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.garment import template
+from physxnet_jax.motion import animate, clip_transforms, load_motion
+
+
+def test_lbs_is_linear_blend_skinning(body, rest):
+    motion = load_motion("punch", fps=30.0)
+    clip = dress("punch", ["top"], method="lbs", frames=18, resolve=False)
+    g = template("top")
+    expected = animate(body, rest, g.rest_vertices(rest), g.skin, motion)
+    np.testing.assert_allclose(clip.garments[0].positions, np.asarray(expected)[:18], atol=1e-5)
+    assert clip.hit_rate["top"] is None and clip.num_frames == 18
+
+
+def test_the_network_moves_cloth_away_from_skinning_but_stays_near_the_body():
+    a = dress("walk", ["bottom", "dress"], frames=20)
+    b = dress("walk", ["bottom", "dress"], method="lbs", frames=20)
+    for x, y in zip(a.garments, b.garments):
+        gap = np.linalg.norm(x.positions - y.positions, axis=2)
+        assert np.isfinite(gap).all() and 1e-3 < gap.mean() < 0.1 and gap.max() < 0.5
+    assert a.hit_rate["bottom"] > 0.95 and a.fallbacks["bottom"] is not None
+    assert all(v < 0.02 for v in a.inside.values())
+    assert {s.name for s in a.stages} >= {"motion", "binding", "network", "body"}
+
+
+def test_the_simulation_is_what_its_own_rollout_says():
+    clip = dress("balance", ["bottom"], method="simulate", frames=4)
+    assert np.isfinite(clip.garments[0].positions).all()
+    waist = np.asarray(template("bottom").pinned)
+    lbs = dress("balance", ["bottom"], method="lbs", frames=4, resolve=False)
+    gap = clip.garments[0].positions[:, waist] - lbs.garments[0].positions[:, waist]
+    assert np.abs(gap).max() < 1e-4
+
+
+def test_push_out_lifts_what_is_inside_and_touches_nothing_else(body, rest):
+    g = template("bottom")
+    wearable = unbound_wearable(body, rest, g)
+    patch = make_patch(body, rest, wearable)
+    motion = load_motion("balance", fps=30.0)
+    world, shift = (jnp.asarray(x[0]) for x in clip_transforms(body, rest, motion))
+    from physxnet_jax.models import skin_wearable
+
+    x = skin_wearable(wearable, world, shift)
+    height, normal = skin_height(patch, x, world, shift)
+    clear = np.asarray(height) > 0.003
+    same = push_out(patch, x, world, shift)
+    np.testing.assert_array_equal(np.asarray(same)[clear], np.asarray(x)[clear])
+    sunk = x - (height + 0.01)[:, None] * normal
+    assert float(jnp.mean(skin_height(patch, sunk, world, shift)[0])) < -0.005
+    lifted = push_out(patch, sunk, world, shift)
+    after = np.asarray(skin_height(patch, lifted, world, shift)[0])
+    assert np.mean(after > -1e-3) > 0.97
+
+
+def test_two_garments_of_one_name_and_one_called_body_stay_apart(tmp_path):
+    import dataclasses
+
+    named = dataclasses.replace(template("bottom"), name="body")
+    clip = dress("walk", [named, "bottom", "bottom"], method="lbs", frames=2)
+    assert [m.name for m in clip.meshes] == ["body", "body_2", "bottom", "bottom_2"]
+
+
+def test_nonsense_is_refused():
+    with pytest.raises(PhysXNetError, match="at least one garment"):
+        dress("walk", [], method="lbs", frames=2)
+    with pytest.raises(PhysXNetError, match="at least one"):
+        dress("walk", method="lbs", frames=0)

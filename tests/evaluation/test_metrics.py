@@ -1,0 +1,18 @@
+"""Errors in closed form."""
+
+import numpy as np
+import pytest
+
+from physxnet_jax.evaluation import vertex_error
+
+
+def test_a_known_shift_has_a_known_error():
+    x = np.random.default_rng(0).normal(size=(3, 7, 3)).astype(np.float32)
+    e = vertex_error(x + np.array([0.003, 0.0, 0.004], np.float32), x)
+    assert e.rmse_mm == pytest.approx(5.0, rel=1e-3) and e.mse_mm2 == pytest.approx(25.0, rel=1e-3)
+    assert e.mean_mm == pytest.approx(5.0, rel=1e-3) and e.max_mm == pytest.approx(5.0, rel=1e-3)
+    half = x.copy()
+    half[..., :3, 0] += 0.0
+    assert vertex_error(half, x).max_mm == 0.0
+    with pytest.raises(ValueError, match="one shape"):
+        vertex_error(x[:, :2], x)

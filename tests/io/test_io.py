@@ -1,0 +1,211 @@
+"""Writers read back by independent readers; broken files refused in a sentence."""
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from physxnet_jax.errors import FormatError, MeshError, WeightsError
+from physxnet_jax.garment import template
+from physxnet_jax.io import (
+    AnimatedMesh,
+    list_weights,
+    load_garment,
+    load_predictor,
+    read_card,
+    read_obj,
+    read_pc2,
+    save_predictor,
+    write_clip,
+    write_obj,
+    write_pc2,
+)
+
+QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+
+
+@pytest.fixture
+def clip():
+    rng = np.random.default_rng(0)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    uv = rng.uniform(size=(4, 2)).astype(np.float32)
+    return [
+        AnimatedMesh(
+            "2020 shirt-x", rng.normal(size=(5, 4, 3)).astype(np.float32), faces, uv, faces
+        ),
+        AnimatedMesh("2020_shirt_x", rng.normal(size=(5, 4, 3)).astype(np.float32), faces),
+    ]
+
+
+def test_usd_is_read_back_with_rate_axis_unit_uv_normals_and_velocities(tmp_path, clip):
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom
+
+    (path,) = write_clip(tmp_path / "a.usdc", clip, 24.0)
+    stage = usd.Stage.Open(str(path))
+    assert UsdGeom.GetStageUpAxis(stage) == "Y" and UsdGeom.GetStageMetersPerUnit(stage) == 1.0
+    assert stage.GetTimeCodesPerSecond() == 24.0
+    assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0, 4)
+    prims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+    assert len(prims) == 2 and stage.GetDefaultPrim().GetName() == "Person"
+    for m, prim in zip(clip, prims):
+        mesh = UsdGeom.Mesh(prim)
+        for k in range(5):
+            np.testing.assert_allclose(
+                np.asarray(mesh.GetPointsAttr().Get(k)), m.positions[k], atol=1e-6
+            )
+        speed = np.asarray(mesh.GetVelocitiesAttr().Get(3))
+        np.testing.assert_allclose(
+            speed, 24 * (m.positions[3] - m.positions[2]), rtol=1e-4, atol=1e-4
+        )
+        normals = np.asarray(mesh.GetNormalsAttr().Get(2))
+        np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-5)
+        np.testing.assert_array_equal(
+            np.asarray(mesh.GetFaceVertexIndicesAttr().Get()), m.faces.ravel()
+        )
+    st = UsdGeom.PrimvarsAPI(prims[0]).GetPrimvar("st")
+    np.testing.assert_allclose(
+        np.asarray(st.Get())[np.asarray(st.GetIndices())],
+        clip[0].uv[clip[0].uv_faces.ravel()],
+        atol=1e-6,
+    )
+
+
+def test_pc2_and_obj_keep_the_vertex_order(tmp_path, clip):
+    files = write_clip(tmp_path / "a.pc2", clip, 30.0)
+    assert len(files) == 4
+    np.testing.assert_array_equal(read_pc2(files[0]), clip[0].positions)
+    mesh = trimesh.load(files[1], process=False, force="mesh", maintain_order=True)
+    ours = read_obj(files[1])
+    np.testing.assert_allclose(ours.vertices, clip[0].positions[0], atol=1e-5)
+    np.testing.assert_allclose(mesh.triangles, clip[0].positions[0][clip[0].faces], atol=1e-5)
+    np.testing.assert_allclose(ours.uv[ours.uv_faces], clip[0].uv[clip[0].uv_faces], atol=1e-5)
+
+
+def test_npz_needs_no_pickle(tmp_path, clip):
+    (path,) = write_clip(tmp_path / "a.npz", clip, 30.0)
+    with np.load(path, allow_pickle=False) as data:
+        np.testing.assert_array_equal(data["2020_shirt_x_positions"], clip[1].positions)
+
+
+def test_unknown_extensions_and_truncated_caches_are_refused_and_leave_nothing(tmp_path, clip):
+    with pytest.raises(FormatError, match=r"\.usdc"):
+        write_clip(tmp_path / "a.abc", clip, 30.0)
+    write_pc2(tmp_path / "a.pc2", clip[0].positions)
+    blob = (tmp_path / "a.pc2").read_bytes()
+    (tmp_path / "b.pc2").write_bytes(blob[:-5])
+    with pytest.raises(FormatError, match="truncated"):
+        read_pc2(tmp_path / "b.pc2")
+    ragged = [AnimatedMesh("x", clip[0].positions, np.array([[0, 1, 9]]))]
+    with pytest.raises(Exception):  # noqa: B017
+        write_clip(tmp_path / "c.usdc", ragged, 30.0)
+    assert not list(tmp_path.glob(".part-*"))
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("", "both"),
+        ("\0\0", "binary"),
+        (QUAD, "both"),
+        (QUAD + "f 1 2 9\n", ":9:"),
+        (QUAD + "f 0 1 2\n", "from 1"),
+        (QUAD + "f 1 2\n", "fewer than three"),
+        (QUAD + "f 1 1 2\n", "fewer than three"),
+        (QUAD + "f 1/9 2/1 3/1\n", "uv 9"),
+        (QUAD.replace("1 1 0", "1 nan 0") + "f 1 2 3\n", "finite"),
+        (QUAD.replace("1 1 0", "1 one 0") + "f 1 2 3\n", "numbers"),
+    ],
+)
+def test_broken_obj_files_are_refused(tmp_path, text, says):
+    path = tmp_path / "a.obj"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=says):
+        read_obj(path)
+
+
+def test_quads_split_along_the_shorter_diagonal_and_negative_indices_count_back(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0 0\nv 3 0 0\nv 4 1 0\nv 1 1 0\nf -4 -3 -2 -1\n")
+    mesh = read_obj(path)
+    assert mesh.polygons == 1 and len(mesh.faces) == 2
+    assert {1, 3} <= set(mesh.faces[0]) and {1, 3} <= set(mesh.faces[1])
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 0.01), ("dm", 0.1), ("mm", 0.001)])
+def test_units_and_axes_are_found(tmp_path, unit, scale):
+    g = template("bottom")
+    v = np.asarray(g.mesh.vertices) / scale
+    write_obj(tmp_path / "y.obj", v, np.asarray(g.mesh.faces))
+    turned = np.column_stack([v[:, 0], -v[:, 2], v[:, 1]])
+    write_obj(tmp_path / "z.obj", turned, np.asarray(g.mesh.faces))
+    for name, up in (("y", "Y"), ("z", "Z")):
+        loaded, report = load_garment(tmp_path / f"{name}.obj")
+        assert (report.unit, report.up, report.template) == (unit, up, "bottom")
+        np.testing.assert_allclose(
+            np.asarray(loaded.mesh.vertices), np.asarray(g.mesh.vertices), atol=2e-4
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("tee", "top"),
+        ("longsleeve", "top"),
+        ("pants", "bottom"),
+        ("pants_f_tight", "bottom"),
+        ("F_Dress_01", "dress"),
+        ("helper_skirt", "dress"),
+        ("Tank_Top_01", "top"),
+    ],
+)
+def test_real_garments_load_on_the_body(data_dir, name, kind):
+    garment, report = load_garment(data_dir / "garments" / f"{name}.obj")
+    assert report.unit == "dm" and report.up == "Y" and report.template == kind
+    assert report.topology["non_manifold_edges"] == 0
+    assert np.isfinite(np.asarray(garment.skin)).all()
+    from physxnet_jax.body import load_body
+    from physxnet_jax.garment import clearance
+
+    distance, _ = clearance(load_body().rest_mesh(), np.asarray(garment.mesh.vertices))
+    # Even the trousers that cut into the body on purpose end up outside it.
+    assert np.mean(distance < -1e-3) < 0.02
+
+
+def test_meshes_that_are_nowhere_near_a_body_are_refused(tmp_path):
+    rng = np.random.default_rng(0)
+    write_obj(tmp_path / "a.obj", rng.uniform(50, 60, (30, 3)), np.arange(30).reshape(10, 3))
+    with pytest.raises(MeshError, match="no unit and up axis"):
+        load_garment(tmp_path / "a.obj")
+    with pytest.raises(MeshError, match="OBJ"):
+        load_garment(tmp_path / "a.fbx")
+
+
+def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
+    assert "first" in list_weights()
+    predictor = load_predictor("first")
+    assert read_card("first")["model"]["family"] == "local"
+    save_predictor(tmp_path / "w", predictor, name="copy")
+    again = load_predictor(tmp_path / "w")
+    import jax
+
+    for a, b in zip(jax.tree.leaves(predictor.state), jax.tree.leaves(again.state)):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
+    blob = bytearray((tmp_path / "w/weights.safetensors").read_bytes())
+    blob[-1] ^= 1
+    (tmp_path / "w/weights.safetensors").write_bytes(bytes(blob))
+    with pytest.raises(WeightsError, match="damaged"):
+        load_predictor(tmp_path / "w")
+    card = json.loads((tmp_path / "w/card.json").read_text())
+    import hashlib
+
+    card |= {"sha256": hashlib.sha256(bytes(blob)).hexdigest(), "atlas": "0" * 16}
+    (tmp_path / "w/card.json").write_text(json.dumps(card))
+    with pytest.raises(WeightsError, match="atlas"):
+        load_predictor(tmp_path / "w")
+    (tmp_path / "w/card.json").write_text("{")
+    with pytest.raises(WeightsError, match="damaged"):
+        load_predictor(tmp_path / "w")
+    with pytest.raises(WeightsError, match="first"):
+        load_predictor("second")
