@@ -59,6 +59,17 @@ def test_push_out_lifts_what_is_inside_and_touches_nothing_else(body, rest):
     assert np.mean(after > -1e-3) > 0.97
 
 
+def test_trousers_go_beneath_a_top_and_stay_as_they_are_without_one():
+    both = dress("walk", ["top", "bottom"], frames=16)
+    alone = dress("walk", ["bottom"], frames=16)
+    rest_height = np.asarray(template("bottom").mesh.vertices)[:, 1]
+    covered = rest_height > float(np.asarray(template("top").mesh.vertices)[:, 1].min())
+    a, b = both.garments[1].positions, alone.garments[0].positions
+    gap = np.linalg.norm(a - b, axis=2)
+    assert gap[:, covered].max() > 2e-3
+    assert gap[:, rest_height < -0.4].max() < 1e-4
+
+
 def test_two_garments_of_one_name_and_one_called_body_stay_apart(tmp_path):
     import dataclasses
 

@@ -15,4 +15,5 @@ from ._push_out import (
     make_patch as make_patch,
     push_out as push_out,
     skin_height as skin_height,
+    tuck_in as tuck_in,
 )

@@ -37,7 +37,7 @@ from ..motion import (
 )
 from ..simulation import XPBD, Scene, prepare_scene, simulate_batch
 from ..uv import Binding, Transference, bind
-from ._push_out import SkinPatch, make_patch, push_out, skin_height
+from ._push_out import SkinPatch, make_patch, push_out, skin_height, tuck_in
 
 Method = Literal["network", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "lbs", "simulate")
@@ -176,7 +176,7 @@ def dress(
             fallbacks[w.name] = w.binding.fallbacks
     else:
         wearables = [unbound_wearable(body, rest, g) for g in garments]
-    patches = [make_patch(body, rest, w) for w in wearables]
+    patches = tuck_in([make_patch(body, rest, w) for w in wearables], wearables)
     if method == "simulate":
         positions = _simulate(garments, clip, body, shape, stages, progress)
     else:

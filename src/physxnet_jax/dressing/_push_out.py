@@ -1,6 +1,7 @@
 """The last touch: vertices that a prediction left inside the body move onto it."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,8 @@ from ..typing import pytree
 
 # Triangles compared for each vertex: a patch of about five centimetres.
 _PATCH = 20
+# Least height of cloth above the skin; of a top above trousers; most of those beneath it [m].
+_GAP, _ABOVE, _BENEATH = 0.002, 0.010, 0.005
 
 
 @pytree
@@ -28,6 +31,8 @@ class SkinPatch:
         weights: Their skinning weights, shape [skin, joints].
         faces: Triangles over them, shape [faces, 3].
         candidates: Triangles near each garment vertex, shape [vertices, k].
+        least: Least height above the skin [m], shape [vertices].
+        most: Greatest height, for what is worn beneath something [m], shape [vertices].
     """
 
     rest: Float[Array, "skin 3"]
@@ -35,6 +40,8 @@ class SkinPatch:
     weights: Float[Array, "skin joints"]
     faces: Int[Array, "faces 3"]
     candidates: Int[Array, "vertices k"]
+    least: Float[Array, " vertices"]
+    most: Float[Array, " vertices"]
 
 
 def make_patch(body: Body, rest: Float[Array, "all 3"], wearable: Wearable) -> SkinPatch:
@@ -52,7 +59,31 @@ def make_patch(body: Body, rest: Float[Array, "all 3"], wearable: Wearable) -> S
         body.weights[pick],
         jnp.asarray(corners.reshape(-1, 3).astype(np.int32)),
         jnp.asarray(local_faces.reshape(near.shape).astype(np.int32)),
+        jnp.full((near.shape[0],), _GAP, jnp.float32),
+        jnp.full((near.shape[0],), jnp.inf, jnp.float32),
     )
+
+
+def tuck_in(patches: Sequence[SkinPatch], wearables: Sequence[Wearable]) -> tuple[SkinPatch, ...]:
+    """Patches for garments worn together: trousers go beneath a top.
+
+    Where a top covers them at rest, trousers keep near the skin and the top keeps off it.
+    Elsewhere nothing changes, and a garment worn alone isn't touched.
+    """
+    tops = [w for w in wearables if w.template == "top"]
+    if not tops or all(w.template != "bottom" for w in wearables):
+        return tuple(patches)
+    hem = min(float(w.rest[:, 1].min()) for w in tops)
+    out = []
+    for patch, w in zip(patches, wearables, strict=True):
+        below = jnp.maximum(hem - w.rest[:, 1], 0.0)
+        if w.template == "bottom":
+            # Released over a few centimetres below the hem, so that no step shows.
+            patch = dataclasses.replace(patch, most=_BENEATH + 2.0 * below)
+        elif w.template == "top":
+            patch = dataclasses.replace(patch, least=jnp.full_like(patch.least, _ABOVE))
+        out.append(patch)
+    return tuple(out)
 
 
 def skin_height(
@@ -78,10 +109,9 @@ def push_out(
     rotations: Float[Array, "joints 3 3"],
     translations: Float[Array, "joints 3"],
     *,
-    gap: float = 0.002,
     deepest: float = 0.04,
 ) -> Float[Array, "vertices 3"]:
-    """Points lifted to a small gap above the skin where they are below it.
+    """Points moved along the normal to the least and greatest height of their patch.
 
     Continuous in its inputs. Points deeper than ``deepest`` are on another limb's far
     side, not in the skin, and stay; in the last quarter before it the lift fades out.
@@ -91,10 +121,9 @@ def push_out(
         points: Garment vertices [m].
         rotations: World rotations of joints.
         translations: World translations of joints [m].
-        gap: Least height above the skin [m].
         deepest: Depth from which on nothing is done [m].
     """
     height, normal = skin_height(patch, points, rotations, translations)
     fade = jnp.clip((height + deepest) / (0.25 * deepest), 0.0, 1.0)
-    lift = fade * jnp.maximum(gap - height, 0.0)
+    lift = fade * jnp.maximum(patch.least - height, 0.0) - jnp.maximum(height - patch.most, 0.0)
     return points + lift[:, None] * normal
