@@ -27,6 +27,7 @@ from ..geometry import (
     make_mesh,
     manifold_report,
     nearby_faces,
+    vertex_normals,
 )
 from ._obj import ObjMesh, read_obj
 
@@ -108,7 +109,9 @@ def load_garment(
     rest = body.rest_vertices(body.default_shape())
     mesh = body.rest_mesh()
     skin = np.asarray(mesh.vertices)
-    v, unit, up = _place(path, raw.vertices, skin)
+    v, unit, up = _place(
+        path, raw.vertices, skin, np.asarray(vertex_normals(mesh.vertices, mesh.faces))
+    )
     distance, _ = clearance(mesh, v)
     inside = distance < _NEAREST
     moved = v
@@ -153,7 +156,7 @@ def load_garment(
 
 
 def _place(
-    path: pathlib.Path, vertices: np.ndarray, skin: np.ndarray
+    path: pathlib.Path, vertices: np.ndarray, skin: np.ndarray, normals: np.ndarray
 ) -> tuple[Float[np.ndarray, "vertices 3"], str, str]:
     """The unit and axis that bring the mesh closest to the skin."""
     tree = KDTree(skin)
@@ -167,7 +170,10 @@ def _place(
                 size = np.ptp(v, axis=0).max()
                 if not 0.1 < size < 2.5:
                     continue
-                score = float(np.mean(tree.query(v)[0]))
+                distance, nearest = tree.query(v)
+                depth = np.einsum("ij,ij->i", skin[nearest] - v, normals[nearest])
+                # A garment too small by a unit lies close to the skin, but within it.
+                score = float(np.mean(distance)) + 0.2 * float(np.mean(depth > 0.015))
                 if score < best[0] - 1e-9:
                     best = (score, v, unit, up)
     score, v, unit, up = best
