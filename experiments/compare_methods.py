@@ -1,9 +1,9 @@
 """Network and skinning against the simulation on held-out actions: error beside time.
 
 Command: python experiments/compare_methods.py --dataset runs/first/dataset
-Cost:    about four minutes on two cores.
-Result:  experiments/results/compare_methods.json and .md; the README's table is the
-         row set of `punch`. All errors are distances of template vertices from our
+Cost:    about five minutes on two cores; with `--only punch` one.
+Result:  experiments/results/compare_methods.json and .md; the README's table is
+         that of `--only punch`. All errors are distances of template vertices from our
          own simulation, before the push-out; times are medians after warm-up, of the
          whole way from joint rotations to garment vertices, in the same run.
 """
@@ -30,11 +30,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--dataset", type=pathlib.Path, default=pathlib.Path("runs/first/dataset"))
     parser.add_argument("--weights", default="first")
+    parser.add_argument("--only", default="", help="one action; written as compare_NAME")
     args = parser.parse_args()
     console = Console()
     scenes = {t: prepare_scene(Scene((template(t),))) for t in TEMPLATES}
     rows = []
     for folder in list_sequences(args.dataset, "test"):
+        if args.only and folder.name != args.only:
+            continue
         s = read_sequence(folder)
         reference = {t: skinned_cloth(scenes[t], s.motion) + s.offsets[t] for t in TEMPLATES}
         for method in ("network", "lbs", "simulate"):
@@ -63,8 +66,9 @@ def main() -> None:
                 )
                 console.print(f"{s.name:15} {t:7} {method:9} {error.rmse_mm:7.2f} mm  {warm} ms")
     OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "compare_methods.json").write_text(json.dumps(rows, indent=1))
-    (OUT / "compare_methods.md").write_text(markdown(rows))
+    name = f"compare_{args.only or 'methods'}"
+    (OUT / f"{name}.json").write_text(json.dumps(rows, indent=1))
+    (OUT / f"{name}.md").write_text(markdown(rows))
 
 
 def markdown(rows: list[dict]) -> str:

@@ -12,8 +12,8 @@ def closing_table(clip: DressedClip) -> list[Table]:
         title_justify="left",
     )
     times.add_column("stage")
-    times.add_column("first time [ms]", justify="right")
-    times.add_column("warm [ms a frame]", justify="right")
+    times.add_column("first time (ms)", justify="right")
+    times.add_column("warm (ms a frame)", justify="right")
     for stage in clip.stages:
         warm = "" if stage.warm_ms is None else f"{stage.warm_ms:.2f}"
         times.add_row(stage.name, f"{stage.cold_ms:.0f}", warm)

@@ -126,7 +126,8 @@ def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
             f"{weights}: trained on atlas {card['atlas']}, this version makes"
             f" {atlas.digest()}. Use the package version that the weights came with."
         )
-    network = make_generator(model)
+    # Shapes alone: drawing random parameters only to replace them takes seconds.
+    network = nnx.eval_shape(lambda: make_generator(model))
     network.eval()
     graph, state = nnx.split(network)
     like, structure = jax.tree.flatten(state)
