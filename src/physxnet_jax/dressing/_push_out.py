@@ -17,7 +17,7 @@ from ..typing import pytree
 # Triangles compared for each vertex: a patch of about five centimetres.
 _PATCH = 20
 # Least height of cloth above the skin; of a top above trousers; most of those beneath it [m].
-_GAP, _ABOVE, _BENEATH = 0.002, 0.010, 0.005
+_GAP, _ABOVE, _BENEATH = 0.005, 0.011, 0.006
 
 
 @pytree

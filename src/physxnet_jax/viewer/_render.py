@@ -75,6 +75,8 @@ class _Stage:
         eye = target + np.array([1.3, 0.5, 3.4])
         self.plotter.camera_position = [tuple(eye), tuple(target), (0.0, 1.0, 0.0)]
         self.plotter.camera.view_angle = 32.0
+        # A screenshot alone would show the meshes from where the camera stood before.
+        self.plotter.render()
         return np.asarray(self.plotter.screenshot(return_img=True))
 
 
