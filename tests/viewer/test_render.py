@@ -1,5 +1,7 @@
 """Pictures: not empty, and videos of the right length."""
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,9 @@ from physxnet_jax.viewer import render_frame, render_preview
 pytest.importorskip("pyvista")
 
 
+# imageio's own reader leaves ffmpeg's pipes to the garbage collector.
+@pytest.mark.filterwarnings("ignore::ResourceWarning")
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_dressed_person_is_in_the_picture(tmp_path):
     clip = dress("walk", ["bottom"], method="lbs", frames=4)
     image = render_frame(clip.meshes, 2, size=(160, 192))
@@ -22,6 +27,7 @@ def test_a_dressed_person_is_in_the_picture(tmp_path):
     import imageio.v3 as iio
 
     frames = iio.imread(tmp_path / "a.mp4").astype(int)
+    gc.collect()
     assert frames.shape[0] == 4
     assert np.abs(frames[3] - frames[0]).mean() > 0.3, "nobody moves"
     assert np.asarray(iio.imread(tmp_path / "a.png")).std() > 5
