@@ -8,7 +8,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..body import Body
 from ..garment import Garment
-from ..geometry import connected_components
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,11 +90,6 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         cat(loose),
         tuple(parts),
     )
-
-
-def cloth_components(assembly: Assembly) -> Int[np.ndarray, " vertices"]:
-    """Component of every cloth vertex."""
-    return connected_components(assembly.faces, len(assembly.rest))
 
 
 def float32(x: np.ndarray) -> Array:
