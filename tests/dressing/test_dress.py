@@ -1,13 +1,12 @@
 """Dressing: methods agree where they must, and nothing inside the body is left."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physxnet_jax.dressing import dress, make_patch, push_out, skin_height, unbound_wearable
+from physxnet_jax.dressing import dress
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import template
-from physxnet_jax.motion import animate, clip_transforms, load_motion
+from physxnet_jax.motion import animate, load_motion
 
 
 def test_lbs_is_linear_blend_skinning(body, rest):
@@ -37,26 +36,6 @@ def test_the_simulation_is_what_its_own_rollout_says():
     lbs = dress("balance", ["bottom"], method="lbs", frames=4, resolve=False)
     gap = clip.garments[0].positions[:, waist] - lbs.garments[0].positions[:, waist]
     assert np.abs(gap).max() < 1e-4
-
-
-def test_push_out_lifts_what_is_inside_and_touches_nothing_else(body, rest):
-    g = template("bottom")
-    wearable = unbound_wearable(body, rest, g)
-    patch = make_patch(body, rest, wearable)
-    motion = load_motion("balance", fps=30.0)
-    world, shift = (jnp.asarray(x[0]) for x in clip_transforms(body, rest, motion))
-    from physxnet_jax.models import skin_wearable
-
-    x = skin_wearable(wearable, world, shift)
-    height, normal = skin_height(patch, x, world, shift)
-    clear = np.asarray(height) > float(patch.least.max()) + 1e-4
-    same = push_out(patch, x, world, shift)
-    np.testing.assert_array_equal(np.asarray(same)[clear], np.asarray(x)[clear])
-    sunk = x - (height + 0.01)[:, None] * normal
-    assert float(jnp.mean(skin_height(patch, sunk, world, shift)[0])) < -0.005
-    lifted = push_out(patch, sunk, world, shift)
-    after = np.asarray(skin_height(patch, lifted, world, shift)[0])
-    assert np.mean(after > -1e-3) > 0.97
 
 
 def test_trousers_go_beneath_a_top_and_stay_as_they_are_without_one():

@@ -1,12 +1,11 @@
 """Dressing: the whole way from motion and garments to animated meshes."""
 
+from ._blocks import dress_block as dress_block
 from ._dress import (
     METHODS as METHODS,
     DressedClip as DressedClip,
     Method as Method,
-    Stage as Stage,
     dress as dress,
-    dress_block as dress_block,
     fit_surface as fit_surface,
     unbound_wearable as unbound_wearable,
 )
@@ -17,3 +16,5 @@ from ._push_out import (
     skin_height as skin_height,
     tuck_in as tuck_in,
 )
+from ._skirt import SkirtPatch as SkirtPatch
+from ._stages import Stage as Stage

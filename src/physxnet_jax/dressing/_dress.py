@@ -1,13 +1,10 @@
 """From motion and garments to dressed, animated meshes."""
 
 import dataclasses
-import functools
 import pathlib
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,48 +13,24 @@ from ..body import Body, load_body
 from ..errors import PhysXNetError
 from ..garment import Garment
 from ..io import DEFAULT, AnimatedMesh, load_garment, load_predictor
-from ..models import (
-    WINDOW,
-    Predictor,
-    Wearable,
-    dress_frames,
-    make_surface,
-    make_wearable,
-    skin_wearable,
-)
+from ..models import Predictor, Wearable, make_surface, make_wearable
 from ..motion import (
-    BLOCK,
     Motion,
     body_animation,
     clip_transforms,
     load_motion,
-    padded_block,
     resample,
     stand_on_floor,
 )
-from ..simulation import XPBD, Scene, prepare_scene, simulate_batch
 from ..uv import Binding, Transference, bind
-from ._push_out import SkinPatch, make_patch, push_out, skin_height, tuck_in
+from ._blocks import inside_share, predict_clip, simulate_clip
+from ._push_out import make_patch, tuck_in
+from ._stages import Stage, Watch
 
 Method = Literal["network", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "lbs", "simulate")
 _COLOURS = ((0.16, 0.27, 0.55), (0.55, 0.28, 0.20), (0.25, 0.45, 0.30), (0.45, 0.25, 0.45))
 _SKIN_COLOUR = (0.69, 0.46, 0.33)
-
-
-@dataclasses.dataclass(frozen=True)
-class Stage:
-    """Time of one stage.
-
-    Attributes:
-        name: What was done.
-        cold_ms: First time, compilation included [ms]; in all if not by frame.
-        warm_ms: Median of the later times [ms a frame]; None if it ran once.
-    """
-
-    name: str
-    cold_ms: float
-    warm_ms: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,7 +118,7 @@ def dress(
     if frames is not None and frames < 1:
         raise PhysXNetError(f"frames is {frames}; ask for at least one.")
     stages: list[Stage] = []
-    watch = _Watch(stages)
+    watch = Watch(stages)
     body = load_body() if body is None else body
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     with watch("motion"):
@@ -176,16 +149,19 @@ def dress(
             fallbacks[w.name] = w.binding.fallbacks
     else:
         wearables = [unbound_wearable(body, rest, g) for g in garments]
-    patches = tuck_in([make_patch(body, rest, w) for w in wearables], wearables)
+    patches = tuck_in(
+        [make_patch(body, rest, w, g.mesh) for w, g in zip(wearables, garments, strict=True)],
+        wearables,
+    )
     if method == "simulate":
-        positions = _simulate(garments, clip, body, shape, stages, progress)
+        positions = simulate_clip(garments, clip, body, shape, stages, progress)
     else:
-        positions = _predict(
+        positions = predict_clip(
             predictor, wearables, patches, world, shift, clip.fps, resolve, stages, progress
         )
     inside_raw: Any = positions.pop("inside_raw", None)
     inside = {
-        w.name: _inside_share(p, positions[w.name], world, shift)
+        w.name: inside_share(p, positions[w.name], world, shift)
         for w, p in zip(wearables, patches, strict=True)
     }
     meshes = []
@@ -228,25 +204,6 @@ def dress(
     )
 
 
-class _Watch:
-    """Notes how long each stage takes."""
-
-    def __init__(self, stages: list[Stage]) -> None:
-        self._stages = stages
-        self._name = ""
-        self._start = 0.0
-
-    def __call__(self, name: str) -> "_Watch":
-        self._name = name
-        return self
-
-    def __enter__(self) -> None:
-        self._start = time.perf_counter()
-
-    def __exit__(self, *error: object) -> None:
-        self._stages.append(Stage(self._name, 1e3 * (time.perf_counter() - self._start)))
-
-
 def fit_surface(
     predictor: Predictor, body: Body, rest: Float[Array, "all 3"], shape: Any | None
 ) -> Predictor:
@@ -280,125 +237,10 @@ def unbound_wearable(body: Body, rest: Float[Array, "all 3"], garment: Garment) 
         none,
         garment.rest_vertices(rest),
         garment.skin,
+        None,
         garment.template,
         garment.name,
     )
-
-
-@functools.partial(jax.jit, static_argnames=("fps", "resolve"))
-def dress_block(
-    predictor: Predictor | None,
-    wearables: tuple[Wearable, ...],
-    patches: tuple[SkinPatch, ...],
-    rotations: Float[Array, "padded joints 3 3"],
-    translations: Float[Array, "padded joints 3"],
-    fps: float,
-    resolve: bool,
-) -> tuple[tuple[Array, Array], ...]:
-    """Garments of a block of frames and the share of vertices inside before push-out."""
-    last = slice(WINDOW - 1, None)
-    r, t = rotations[last], translations[last]
-    if predictor is None:
-        raw = tuple(jax.vmap(lambda a, b, w=w: skin_wearable(w, a, b))(r, t) for w in wearables)
-    else:
-        raw = dress_frames(predictor, wearables, rotations, translations, fps)
-    out = []
-    for x, patch in zip(raw, patches, strict=True):
-        height = jax.vmap(lambda p, a, b, q=patch: skin_height(q, p, a, b)[0])(x, r, t)
-        inside = jnp.mean((height < 0).astype(x.dtype), axis=1)
-        if resolve:
-            x = jax.vmap(lambda p, a, b, q=patch: push_out(q, p, a, b))(x, r, t)
-        out.append((x, inside))
-    return tuple(out)
-
-
-def _predict(
-    predictor: Predictor | None,
-    wearables: Sequence[Wearable],
-    patches: Sequence[SkinPatch],
-    world: np.ndarray,
-    shift: np.ndarray,
-    fps: float,
-    resolve: bool,
-    stages: list[Stage],
-    progress: Callable[[str, int, int], None] | None,
-) -> dict[str, Any]:
-    name = "network" if predictor is not None else "skinning"
-    frames = len(world)
-    blocks, times = [], []
-    for start in range(0, frames, BLOCK):
-        began = time.perf_counter()
-        out = dress_block(
-            predictor,
-            tuple(wearables),
-            tuple(patches),
-            jnp.asarray(padded_block(world, start, WINDOW - 1)),
-            jnp.asarray(padded_block(shift, start, WINDOW - 1)),
-            fps,
-            resolve,
-        )
-        blocks.append(jax.tree.map(np.asarray, out))
-        times.append(1e3 * (time.perf_counter() - began))
-        if progress is not None:
-            progress(name, min(start + BLOCK, frames), frames)
-    warm = float(np.median(times[1:])) / BLOCK if len(times) > 1 else None
-    stages.append(Stage(name, times[0], warm))
-    result: dict[str, Any] = {"inside_raw": {}}
-    for k, w in enumerate(wearables):
-        result[w.name] = np.concatenate([b[k][0] for b in blocks])[:frames]
-        result["inside_raw"][w.name] = float(
-            np.concatenate([b[k][1] for b in blocks])[:frames].mean()
-        )
-    return result
-
-
-def _simulate(
-    garments: Sequence[Garment],
-    clip: Motion,
-    body: Body,
-    shape: Any | None,
-    stages: list[Stage],
-    progress: Callable[[str, int, int], None] | None,
-) -> dict[str, np.ndarray]:
-    ticks = [time.perf_counter()]
-
-    def tick(done: int, total: int) -> None:
-        ticks.append(time.perf_counter())
-        if progress is not None:
-            progress("simulation", done, total)
-
-    scene = prepare_scene(Scene(tuple(garments), body=body, shape=shape))
-    rollout = simulate_batch(scene, [clip], solver=XPBD(), progress=tick)[0]
-    if not rollout.finite.all():
-        frame = int(np.argmin(rollout.finite))
-        raise PhysXNetError(
-            f"{clip.name}: the simulation isn't finite from frame {frame} on. Look for a"
-            " teleport in the motion or degenerate triangles in the garment."
-        )
-    laps = 1e3 * np.diff(ticks)
-    warm = float(np.median(laps[1:])) / 10 if len(laps) > 1 else None
-    stages.append(Stage("simulation", float(laps[0]), warm))
-    return dict(zip([g.name for g in garments], rollout.positions, strict=True))
-
-
-def _inside_share(
-    patch: SkinPatch, positions: np.ndarray, world: np.ndarray, shift: np.ndarray
-) -> float:
-    shares = []
-    for start in range(0, len(positions), BLOCK):
-        height = _heights(
-            patch,
-            padded_block(positions, start, 0),
-            padded_block(world, start, 0),
-            padded_block(shift, start, 0),
-        )
-        shares.append(np.asarray(height < 0)[: len(positions) - start].mean(axis=1))
-    return float(np.concatenate(shares).mean())
-
-
-@jax.jit
-def _heights(patch: SkinPatch, x: Array, r: Array, t: Array) -> Array:
-    return jax.vmap(lambda p, a, b: skin_height(patch, p, a, b)[0])(x, r, t)
 
 
 def _named(garments: list[Garment]) -> list[Garment]:

@@ -9,15 +9,30 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
-from ..body import NUM_BODY_VERTICES, Body
-from ..geometry import TriMesh, closest_among, safe_normalize, vertex_normals
+from ..body import NUM_BODY_VERTICES, Body, blend_rotations
+from ..geometry import (
+    Stencil,
+    TriMesh,
+    closest_among,
+    gaussian_stencil,
+    mesh_edges,
+    safe_normalize,
+    vertex_normals,
+)
 from ..models import Wearable, skin_points
 from ..typing import pytree
+from ._skirt import SkirtPatch, make_skirt_patch, skirt_lift
 
 # Triangles compared for each vertex: a patch of about five centimetres.
 _PATCH = 20
 # Least height of cloth above the skin; of a top above trousers; most of those beneath it [m].
 _GAP, _ABOVE, _BENEATH = 0.005, 0.011, 0.006
+# Long edges cut corners off a limb of this radius; vertices rise by as much, within reason [m].
+_LIMB, _RISE = 0.05, 0.015
+# Nothing is lifted from deeper than this [m].
+_DEEPEST = 0.04
+# What a leg lifts carries the cloth around it along, over about this distance [m].
+_CARRY = 0.05
 
 
 @pytree
@@ -33,6 +48,8 @@ class SkinPatch:
         candidates: Triangles near each garment vertex, shape [vertices, k].
         least: Least height above the skin [m], shape [vertices].
         most: Greatest height, for what is worn beneath something [m], shape [vertices].
+        skirt: Legs that hanging cloth may meet; None for what lies on the skin.
+        carry: How a lifted part of a skirt carries its neighbourhood along; likewise.
     """
 
     rest: Float[Array, "skin 3"]
@@ -42,26 +59,64 @@ class SkinPatch:
     candidates: Int[Array, "vertices k"]
     least: Float[Array, " vertices"]
     most: Float[Array, " vertices"]
+    skirt: SkirtPatch | None
+    carry: Stencil | None
 
 
-def make_patch(body: Body, rest: Float[Array, "all 3"], wearable: Wearable) -> SkinPatch:
-    """Triangles round the skin point nearest to each vertex at rest."""
+def make_patch(
+    body: Body, rest: Float[Array, "all 3"], wearable: Wearable, garment: TriMesh
+) -> SkinPatch:
+    """Triangles round the skin point nearest to each vertex at rest.
+
+    Args:
+        body: The body.
+        rest: Its rest vertices [m].
+        wearable: The garment on it.
+        garment: The garment's mesh, whose edges decide how far it stands off.
+    """
     mesh = body.mesh(rest[:NUM_BODY_VERTICES])
     faces = np.asarray(mesh.faces)
+    points = np.asarray(wearable.rest)
     middles = np.asarray(mesh.vertices)[faces].mean(axis=1)
-    near = KDTree(middles).query(np.asarray(wearable.rest), k=_PATCH)[1]
-    used_faces, local_faces = np.unique(near, return_inverse=True)
-    rows, corners = np.unique(faces[used_faces], return_inverse=True)
+    near = KDTree(middles).query(points, k=_PATCH)[1]
+    skirt = carry = None
+    taken = near.ravel()
+    if wearable.template == "dress":
+        carry = gaussian_stencil(points, np.asarray(garment.faces), _CARRY)
+        skirt = make_skirt_patch(body, rest, wearable, faces, garment, carry)
+        taken = np.concatenate([taken, np.asarray(skirt.table).ravel()])
+    used, local = np.unique(taken, return_inverse=True)
+    rows, corners = np.unique(faces[used], return_inverse=True)
     pick = jnp.asarray(rows)
+    if skirt is not None:
+        # In terms of the vertices and triangles that are kept.
+        middle = np.searchsorted(rows, np.asarray(skirt.middles)).astype(np.int32)
+        table = local[near.size :].reshape(skirt.table.shape).astype(np.int32)
+        skirt = dataclasses.replace(skirt, middles=jnp.asarray(middle), table=jnp.asarray(table))
     return SkinPatch(
         mesh.vertices[pick],
         vertex_normals(mesh.vertices, mesh.faces)[pick],
         body.weights[pick],
         jnp.asarray(corners.reshape(-1, 3).astype(np.int32)),
-        jnp.asarray(local_faces.reshape(near.shape).astype(np.int32)),
-        jnp.full((near.shape[0],), _GAP, jnp.float32),
+        jnp.asarray(local[: near.size].reshape(near.shape).astype(np.int32)),
+        jnp.asarray(_least_height(points, np.asarray(garment.faces))),
         jnp.full((near.shape[0],), jnp.inf, jnp.float32),
+        skirt,
+        carry,
     )
+
+
+def _least_height(
+    points: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, " vertices"]:
+    """Heights at which straight edges stay out of round limbs [m]."""
+    edges = mesh_edges(faces).vertices
+    length = np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1)
+    longest = np.zeros(len(points))
+    for k in range(2):
+        np.maximum.at(longest, edges[:, k], length)
+    rise = np.minimum(longest**2 / (8 * _LIMB), _RISE)
+    return (_GAP + rise).astype(np.float32)
 
 
 def tuck_in(patches: Sequence[SkinPatch], wearables: Sequence[Wearable]) -> tuple[SkinPatch, ...]:
@@ -74,14 +129,19 @@ def tuck_in(patches: Sequence[SkinPatch], wearables: Sequence[Wearable]) -> tupl
     if not tops or all(w.template != "bottom" for w in wearables):
         return tuple(patches)
     hem = min(float(w.rest[:, 1].min()) for w in tops)
+    pairs = list(zip(patches, wearables, strict=True))
+    beneath = [jnp.maximum(p.least, _BENEATH) for p, w in pairs if w.template == "bottom"]
+    above = float(max(b.max() for b in beneath)) + _ABOVE - _BENEATH
     out = []
-    for patch, w in zip(patches, wearables, strict=True):
+    for patch, w in pairs:
         below = jnp.maximum(hem - w.rest[:, 1], 0.0)
         if w.template == "bottom":
             # Released over a few centimetres below the hem, so that no step shows.
-            patch = dataclasses.replace(patch, most=_BENEATH + 2.0 * below)
+            patch = dataclasses.replace(
+                patch, most=jnp.maximum(patch.least, _BENEATH) + 2.0 * below
+            )
         elif w.template == "top":
-            patch = dataclasses.replace(patch, least=jnp.full_like(patch.least, _ABOVE))
+            patch = dataclasses.replace(patch, least=jnp.maximum(patch.least, above))
         out.append(patch)
     return tuple(out)
 
@@ -92,15 +152,38 @@ def skin_height(
     rotations: Float[Array, "joints 3 3"],
     translations: Float[Array, "joints 3"],
 ) -> tuple[Float[Array, " vertices"], Float[Array, "vertices 3"]]:
-    """Height of points above the nearby skin [m] and the skin's smooth normal there."""
+    """Height of points above the nearby skin [m] and how they move to clear it [m].
+
+    Hanging cloth is measured against both legs, other cloth against the skin it lay
+    on at rest.
+
+    Args:
+        patch: The skin near each point.
+        points: Garment vertices [m].
+        rotations: World rotations of joints.
+        translations: World translations of joints [m].
+    """
     skin, blend = skin_points(patch.rest, patch.weights, rotations, translations)
     normals = jnp.einsum("vab,vb->va", blend, patch.normals)
     hit = closest_among(TriMesh(skin, patch.faces), points, patch.candidates)
     tri = patch.faces[jax.lax.stop_gradient(hit.face)]
-    weights = hit.weights
-    foot = jnp.einsum("vk,vkc->vc", weights, skin[tri])
-    normal = safe_normalize(jnp.einsum("vk,vkc->vc", weights, normals[tri]))
-    return jnp.sum((points - foot) * normal, axis=1), normal
+    foot = jnp.einsum("vk,vkc->vc", hit.weights, skin[tri])
+    normal = safe_normalize(jnp.einsum("vk,vkc->vc", hit.weights, normals[tri]))
+    height = jnp.sum((points - foot) * normal, axis=1)
+    # Deeper points are on another limb's far side, not in the skin.
+    fade = jnp.clip((height + _DEEPEST) / (0.25 * _DEEPEST), 0.0, 1.0)
+    lift = fade * jnp.maximum(patch.least - height, 0.0) - jnp.maximum(height - patch.most, 0.0)
+    move = lift[:, None] * normal
+    if patch.skirt is not None:
+        rows = patch.skirt.rows
+        turn = blend_rotations(patch.skirt.weights, rotations)
+        outward = safe_normalize(jnp.einsum("hab,hb->ha", turn, patch.skirt.outward))
+        lifted, above = skirt_lift(
+            patch.skirt, points[rows], outward, skin, normals, patch.faces, patch.least[rows]
+        )
+        move = move.at[rows].set(lifted)
+        height = height.at[rows].set(above)
+    return height, move
 
 
 def push_out(
@@ -108,22 +191,22 @@ def push_out(
     points: Float[Array, "vertices 3"],
     rotations: Float[Array, "joints 3 3"],
     translations: Float[Array, "joints 3"],
-    *,
-    deepest: float = 0.04,
 ) -> Float[Array, "vertices 3"]:
-    """Points moved along the normal to the least and greatest height of their patch.
+    """Points moved to the least and greatest height of their patch.
 
-    Continuous in its inputs. Points deeper than ``deepest`` are on another limb's far
-    side, not in the skin, and stay; in the last quarter before it the lift fades out.
+    Continuous while the nearest patch of skin doesn't change. Cloth on the skin moves
+    along the skin's normal; vertices deeper than four centimetres are left alone, in
+    the last centimetre before it the lift fades out. Hanging cloth is carried by the
+    legs, see `skirt_lift`: once smoothly, then exactly.
 
     Args:
         patch: The skin near each point.
         points: Garment vertices [m].
         rotations: World rotations of joints.
         translations: World translations of joints [m].
-        deepest: Depth from which on nothing is done [m].
     """
-    height, normal = skin_height(patch, points, rotations, translations)
-    fade = jnp.clip((height + deepest) / (0.25 * deepest), 0.0, 1.0)
-    lift = fade * jnp.maximum(patch.least - height, 0.0) - jnp.maximum(height - patch.most, 0.0)
-    return points + lift[:, None] * normal
+    move = skin_height(patch, points, rotations, translations)[1]
+    if patch.carry is None:
+        return points + move
+    points = points + patch.carry @ move
+    return points + skin_height(patch, points, rotations, translations)[1]

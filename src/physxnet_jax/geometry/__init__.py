@@ -1,7 +1,7 @@
 """Meshes and what can be asked of them. Knows nothing of bodies or garments."""
 
 from ._barycentric import interpolate as interpolate
-from ._candidates import nearby_faces as nearby_faces
+from ._candidates import nearby_faces as nearby_faces, spread_points as spread_points
 from ._closest import (
     ClosestPoints as ClosestPoints,
     closest_among as closest_among,
@@ -22,6 +22,7 @@ from ._rotation import (
     safe_norm as safe_norm,
     safe_normalize as safe_normalize,
 )
+from ._stencil import Stencil as Stencil, gaussian_stencil as gaussian_stencil
 from ._topology import (
     Edges as Edges,
     boundary_loops as boundary_loops,

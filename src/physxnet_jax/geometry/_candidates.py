@@ -33,3 +33,20 @@ def nearby_faces(
     k = min(neighbours, len(used))
     near = KDTree(vertices[used]).query(points, k=k)[1].reshape(len(points), k)
     return around[used[near]].reshape(len(points), -1)
+
+
+def spread_points(
+    points: Float[np.ndarray, "points 3"], spacing: float
+) -> Int[np.ndarray, " chosen"]:
+    """A subset of points at least ``spacing`` [m] apart, greedily in order.
+
+    Every point left out has a chosen one within ``spacing``.
+    """
+    tree = KDTree(points)
+    free = np.ones(len(points), dtype=bool)
+    chosen = []
+    for i in range(len(points)):
+        if free[i]:
+            chosen.append(i)
+            free[tree.query_ball_point(points[i], spacing)] = False
+    return np.asarray(chosen, dtype=np.int64)

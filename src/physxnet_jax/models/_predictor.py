@@ -11,13 +11,16 @@ from jaxtyping import Array, Bool, Float
 
 from ..body import Body
 from ..garment import Garment
-from ..geometry import polar_rotation
+from ..geometry import Stencil, gaussian_stencil, polar_rotation
 from ..typing import pytree
 from ..uv import Atlas, Binding, dress_body
 from ._features import WINDOW, Family, clip_features, num_channels, skin_points
 from ._networks import Generator
 
 _EXACT = jax.lax.Precision.HIGHEST
+# A skirt samples maps of both legs, whose edges don't meet: offsets are averaged over
+# about this distance along the cloth [m].
+_SMOOTH = 0.03
 
 
 @dataclasses.dataclass(frozen=True)
@@ -199,6 +202,8 @@ class Wearable:
         binding: Texels they sample and body points they belong to.
         anchor: Body points at rest that the binding names [m], shape [vertices, 3].
         anchor_weights: Their skinning weights, shape [vertices, joints].
+        smoothing: Mean over the neighbourhood that sampled offsets pass twice; None
+            for cloth that lies on the skin.
         template: The map this garment is dressed by.
         name: Name of the garment.
     """
@@ -208,8 +213,18 @@ class Wearable:
     binding: Binding
     anchor: Float[Array, "vertices 3"]
     anchor_weights: Float[Array, "vertices joints"]
+    smoothing: Stencil | None
     template: str = dataclasses.field(metadata={"static": True})
     name: str = dataclasses.field(metadata={"static": True})
+
+    def sample(
+        self, values: Float[Array, "*batch texels channels"]
+    ) -> Float[Array, "*batch vertices channels"]:
+        """Texel values carried to the garment's vertices."""
+        out = self.binding.sample(values)
+        if self.smoothing is not None:
+            out = self.smoothing @ (self.smoothing @ out)
+        return out
 
 
 def make_wearable(
@@ -217,14 +232,18 @@ def make_wearable(
 ) -> Wearable:
     """A garment ready to be dressed on a body shape."""
     base = rest
+    smoothing = None
     if garment.template == "dress":
         base = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
+        mesh = garment.mesh
+        smoothing = gaussian_stencil(np.asarray(mesh.vertices), np.asarray(mesh.faces), _SMOOTH)
     return Wearable(
         garment.rest_vertices(rest),
         garment.skin,
         binding,
         binding.to_body @ base,
         binding.to_body @ body.weights,
+        smoothing,
         garment.template,
         garment.name,
     )
@@ -261,7 +280,17 @@ def apply_offsets(
     References:
         PhysXNet, equation 3 and section 4.3.
     """
-    sampled = wearable.binding.sample(offsets)
+    return place_sampled(wearable, rotations, translations, wearable.sample(offsets), family)
+
+
+def place_sampled(
+    wearable: Wearable,
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+    sampled: Float[Array, "vertices 3"],
+    family: Family,
+) -> Float[Array, "vertices 3"]:
+    """The same as `apply_offsets`, from offsets already carried to the vertices [m]."""
     if family == "paper":
         points, _ = skin_points(wearable.anchor, wearable.anchor_weights, rotations, translations)
         return points + sampled
@@ -295,8 +324,8 @@ def dress_frames(
     family: Family = predictor.config.family
     last = slice(WINDOW - 1, None)
     return tuple(
-        jax.vmap(lambda r, t, o, w=w: apply_offsets(w, r, t, o, family))(
-            rotations[last], translations[last], offsets[w.template]
+        jax.vmap(lambda r, t, o, w=w: place_sampled(w, r, t, o, family))(
+            rotations[last], translations[last], w.sample(offsets[w.template])
         )
         for w in wearables
     )

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES, Body, triangulate
-from ...geometry import closest_barycentric, vertex_normals
+from ...geometry import closest_barycentric, spread_points, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Attached, Effect, Placed, Prepared
@@ -116,8 +116,8 @@ def _patches(
     size: int,
 ) -> tuple[Int[np.ndarray, "vertices k"], Int[np.ndarray, "centres patch"]]:
     """Centres for each cloth vertex (as body vertices) and the triangles of each."""
-    tight = _spread(skin, spacing)
-    wide = _spread(skin, 1.6 * spacing)
+    tight = spread_points(skin, spacing)
+    wide = spread_points(skin, 1.6 * spacing)
     cloth_label = _limb_labels(assembly.weights, assembly.body)
     out = np.zeros((len(assembly.rest), count), dtype=np.int32)
     for lab in range(5):
@@ -138,18 +138,6 @@ def _patches(
     used = np.unique(out)
     table[used] = KDTree(middles).query(skin[used], k=size)[1].reshape(-1, size)
     return out, table
-
-
-def _spread(points: Float[np.ndarray, "points 3"], spacing: float) -> np.ndarray:
-    """A subset of points at least a distance apart, greedily in order."""
-    tree = KDTree(points)
-    free = np.ones(len(points), dtype=bool)
-    chosen = []
-    for i in range(len(points)):
-        if free[i]:
-            chosen.append(i)
-            free[tree.query_ball_point(points[i], spacing)] = False
-    return np.asarray(chosen)
 
 
 @pytree

@@ -1,0 +1,136 @@
+"""Clips dressed block by block: by the network, by skinning, by the simulator."""
+
+import functools
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..body import Body
+from ..errors import PhysXNetError
+from ..garment import Garment
+from ..models import WINDOW, Predictor, Wearable, dress_frames, skin_wearable
+from ..motion import BLOCK, Motion, padded_block
+from ..simulation import XPBD, Scene, prepare_scene, simulate_batch
+from ._push_out import SkinPatch, push_out, skin_height
+from ._stages import Stage
+
+
+@functools.partial(jax.jit, static_argnames=("fps", "resolve"))
+def dress_block(
+    predictor: Predictor | None,
+    wearables: tuple[Wearable, ...],
+    patches: tuple[SkinPatch, ...],
+    rotations: Float[Array, "padded joints 3 3"],
+    translations: Float[Array, "padded joints 3"],
+    fps: float,
+    resolve: bool,
+) -> tuple[tuple[Array, Array], ...]:
+    """Garments of a block of frames and the share of vertices inside before push-out."""
+    last = slice(WINDOW - 1, None)
+    r, t = rotations[last], translations[last]
+    if predictor is None:
+        raw = tuple(jax.vmap(lambda a, b, w=w: skin_wearable(w, a, b))(r, t) for w in wearables)
+    else:
+        raw = dress_frames(predictor, wearables, rotations, translations, fps)
+    out = []
+    for x, patch in zip(raw, patches, strict=True):
+        height = jax.vmap(lambda p, a, b, q=patch: skin_height(q, p, a, b)[0])(x, r, t)
+        inside = jnp.mean((height < 0).astype(x.dtype), axis=1)
+        if resolve:
+            x = jax.vmap(lambda p, a, b, q=patch: push_out(q, p, a, b))(x, r, t)
+        out.append((x, inside))
+    return tuple(out)
+
+
+def predict_clip(
+    predictor: Predictor | None,
+    wearables: Sequence[Wearable],
+    patches: Sequence[SkinPatch],
+    world: np.ndarray,
+    shift: np.ndarray,
+    fps: float,
+    resolve: bool,
+    stages: list[Stage],
+    progress: Callable[[str, int, int], None] | None,
+) -> dict[str, Any]:
+    name = "network" if predictor is not None else "skinning"
+    frames = len(world)
+    blocks, times = [], []
+    for start in range(0, frames, BLOCK):
+        began = time.perf_counter()
+        out = dress_block(
+            predictor,
+            tuple(wearables),
+            tuple(patches),
+            jnp.asarray(padded_block(world, start, WINDOW - 1)),
+            jnp.asarray(padded_block(shift, start, WINDOW - 1)),
+            fps,
+            resolve,
+        )
+        blocks.append(jax.tree.map(np.asarray, out))
+        times.append(1e3 * (time.perf_counter() - began))
+        if progress is not None:
+            progress(name, min(start + BLOCK, frames), frames)
+    warm = float(np.median(times[1:])) / BLOCK if len(times) > 1 else None
+    stages.append(Stage(name, times[0], warm))
+    result: dict[str, Any] = {"inside_raw": {}}
+    for k, w in enumerate(wearables):
+        result[w.name] = np.concatenate([b[k][0] for b in blocks])[:frames]
+        result["inside_raw"][w.name] = float(
+            np.concatenate([b[k][1] for b in blocks])[:frames].mean()
+        )
+    return result
+
+
+def simulate_clip(
+    garments: Sequence[Garment],
+    clip: Motion,
+    body: Body,
+    shape: Any | None,
+    stages: list[Stage],
+    progress: Callable[[str, int, int], None] | None,
+) -> dict[str, np.ndarray]:
+    ticks = [time.perf_counter()]
+
+    def tick(done: int, total: int) -> None:
+        ticks.append(time.perf_counter())
+        if progress is not None:
+            progress("simulation", done, total)
+
+    scene = prepare_scene(Scene(tuple(garments), body=body, shape=shape))
+    rollout = simulate_batch(scene, [clip], solver=XPBD(), progress=tick)[0]
+    if not rollout.finite.all():
+        frame = int(np.argmin(rollout.finite))
+        raise PhysXNetError(
+            f"{clip.name}: the simulation isn't finite from frame {frame} on. Look for a"
+            " teleport in the motion or degenerate triangles in the garment."
+        )
+    laps = 1e3 * np.diff(ticks)
+    warm = float(np.median(laps[1:])) / 10 if len(laps) > 1 else None
+    stages.append(Stage("simulation", float(laps[0]), warm))
+    return dict(zip([g.name for g in garments], rollout.positions, strict=True))
+
+
+def inside_share(
+    patch: SkinPatch, positions: np.ndarray, world: np.ndarray, shift: np.ndarray
+) -> float:
+    shares = []
+    for start in range(0, len(positions), BLOCK):
+        height = _heights(
+            patch,
+            padded_block(positions, start, 0),
+            padded_block(world, start, 0),
+            padded_block(shift, start, 0),
+        )
+        shares.append(np.asarray(height < 0)[: len(positions) - start].mean(axis=1))
+    return float(np.concatenate(shares).mean())
+
+
+@jax.jit
+def _heights(patch: SkinPatch, x: Array, r: Array, t: Array) -> Array:
+    return jax.vmap(lambda p, a, b: skin_height(patch, p, a, b)[0])(x, r, t)

@@ -1,0 +1,174 @@
+"""Legs in a skirt: which skin a hanging vertex may meet, and the way out of it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
+
+from ..body import NUM_BODY_VERTICES, Body
+from ..geometry import (
+    Stencil,
+    TriMesh,
+    closest_among,
+    safe_normalize,
+    spread_points,
+    vertex_normals,
+)
+from ..models import Wearable
+from ..typing import pytree
+
+# Skin points compared for each vertex, their distance, and the triangles of each [m].
+_CHOICES, _SPACING, _PATCH = 96, 0.03, 20
+# Skin counts as being in front where it faces the way out by at least this cosine.
+_FACING = 0.25
+# A leg is met in full where the way out passes this near a skin point, not at all where
+# it stays this far [m^2].
+_HIT, _MISS = 0.03**2, 0.05**2
+# Cloth isn't carried farther than this by a leg [m].
+_FARTHEST = 0.25
+_NOWHERE = 1e3
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class SkirtPatch:
+    """Skin that hanging cloth may meet: both legs.
+
+    Attributes:
+        rows: Hanging garment vertices, shape [hanging].
+        outward: The way out of the skirt at rest, unit, shape [hanging, 3].
+        weights: Skinning weights of the hanging vertices, shape [hanging, joints].
+        choices: Skin points compared for each, rows of ``middles``, shape [hanging, c].
+        middles: Skin vertices that are compared, shape [patches].
+        table: Triangles around each of them, shape [patches, k].
+    """
+
+    rows: Int[Array, " hanging"]
+    outward: Float[Array, "hanging 3"]
+    weights: Float[Array, "hanging joints"]
+    choices: Int[Array, "hanging c"]
+    middles: Int[Array, " patches"]
+    table: Int[Array, "patches k"]
+
+
+def hanging_vertices(
+    body: Body, rest: Float[np.ndarray, "all 3"], points: Float[np.ndarray, "points 3"]
+) -> Int[np.ndarray, " hanging"]:
+    """Vertices of a dress below the hips."""
+    heads = rest[np.asarray(body.joint_rows)].mean(axis=2)[:, 0]
+    return np.flatnonzero(points[:, 1] < heads[body.joint("LeftUpLeg"), 1] + 0.05)
+
+
+def make_skirt_patch(
+    body: Body,
+    rest: Float[Array, "all 3"],
+    wearable: Wearable,
+    faces: Int[np.ndarray, "faces 3"],
+    garment: TriMesh,
+    carry: Stencil,
+) -> SkirtPatch:
+    """Lists the skin near each hanging vertex, over both legs.
+
+    Args:
+        body: The body.
+        rest: Its rest vertices [m].
+        wearable: A dress.
+        faces: Triangles of the whole body.
+        garment: The dress's mesh.
+        carry: Mean over neighbourhoods of the dress.
+
+    Returns:
+        The patch, in terms of body vertices and faces.
+    """
+    skin = np.asarray(rest)[:NUM_BODY_VERTICES]
+    points = np.asarray(wearable.rest)
+    rows = hanging_vertices(body, np.asarray(rest), points)
+    normals = carry @ vertex_normals(wearable.rest, garment.faces)
+    outward = np.asarray(safe_normalize(normals))[rows]
+    # Some files have their faces inside out.
+    middle = points[rows].mean(axis=0) * [1, 0, 1]
+    outward *= np.sign(np.mean(np.sum(outward * (points[rows] - middle), axis=1)))
+    legs = np.flatnonzero(_leg_share(body)[:NUM_BODY_VERTICES] > 0.3)
+    chosen = legs[spread_points(skin[legs], _SPACING)]
+    k = min(_CHOICES, len(chosen))
+    near = KDTree(skin[chosen]).query(points[rows], k=k)[1].reshape(len(rows), k)
+    table = KDTree(skin[faces].mean(axis=1)).query(skin[chosen], k=_PATCH)[1]
+    return SkirtPatch(
+        jnp.asarray(rows.astype(np.int32)),
+        jnp.asarray(outward),
+        wearable.skin[jnp.asarray(rows)],
+        jnp.asarray(near.astype(np.int32)),
+        jnp.asarray(chosen.astype(np.int32)),
+        jnp.asarray(table.astype(np.int32)),
+    )
+
+
+def _leg_share(body: Body) -> Float[np.ndarray, " all"]:
+    names = ("UpLeg", "Leg", "Foot", "ToeBase")
+    return np.asarray(body.weights)[
+        :, [body.joint(f"{side}{n}") for side in ("Left", "Right") for n in names]
+    ].sum(axis=1)
+
+
+def skirt_lift(
+    patch: SkirtPatch,
+    points: Float[Array, "hanging 3"],
+    outward: Float[Array, "hanging 3"],
+    skin: Float[Array, "skin 3"],
+    normals: Float[Array, "skin 3"],
+    faces: Int[Array, "faces 3"],
+    least: Float[Array, " hanging"],
+) -> tuple[Float[Array, "hanging 3"], Float[Array, " hanging"]]:
+    """How hanging vertices move so as to clear the legs.
+
+    A leg in front of the vertex, seen along the way out of the skirt, carries it: so a
+    leg that comes forward takes the front of the skirt along instead of poking through
+    it. Beside a leg, the vertex keeps off the nearest skin. The two blend.
+
+    Args:
+        patch: The legs.
+        points: Hanging vertices [m].
+        outward: The way out of the skirt in this pose, unit.
+        skin: Skin vertices in this pose [m].
+        normals: Their normals.
+        faces: Triangles over them.
+        least: Wanted height above the skin [m].
+
+    Returns:
+        Displacements [m] and heights above the nearest skin [m].
+    """
+    mesh = TriMesh(skin, faces)
+    lane = jnp.arange(points.shape[0])
+    gap = skin[patch.middles][patch.choices] - points[:, None]
+    along = jnp.einsum("hcx,hx->hc", gap, outward)
+    facing = jnp.einsum("hcx,hx->hc", normals[patch.middles][patch.choices], outward)
+    squared = jnp.sum(gap * gap, axis=-1)
+
+    def meet(cost: Array, where: Array) -> tuple[Array, Array, Array]:
+        """Foot and normal of the skin near ``where``, on the patch of least cost."""
+        pick = jnp.argmin(cost, axis=1)
+        hit = closest_among(mesh, where, patch.table[patch.choices[lane, pick]])
+        tri = faces[jax.lax.stop_gradient(hit.face)]
+        foot = jnp.einsum("hk,hkx->hx", hit.weights, skin[tri])
+        normal = safe_normalize(jnp.einsum("hk,hkx->hx", hit.weights, normals[tri]))
+        return foot, normal, cost[lane, pick]
+
+    foot, near, _ = meet(squared, points)
+    height = jnp.sum((points - foot) * near, axis=1)
+    short = jnp.maximum(least - height, 0.0)[:, None] * near
+    # Skin in front of the vertex, seen along the way out.
+    ahead = (facing > _FACING) & (along > -_SPACING) & (along < _FARTHEST)
+    beside = jnp.where(ahead, squared - along * along, _NOWHERE)
+    reach = along[lane, jnp.argmin(beside, axis=1)]
+    there = points + reach[:, None] * outward
+    front, normal, cost = meet(beside, there)
+    slope = jnp.maximum(jnp.sum(normal * outward, axis=1), _FACING)
+    way = (jnp.sum((front - points) * normal, axis=1) + least) / slope
+    # The way out passes beside the nearest skin point by the root of the cost.
+    share = jnp.clip((_MISS - cost) / (_MISS - _HIT), 0.0, 1.0)
+    share = (share * share * (3 - 2 * share))[:, None]
+    long = jnp.clip(way, 0.0, _FARTHEST)[:, None] * outward
+    return short + share * (long - short), height

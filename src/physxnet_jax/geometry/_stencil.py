@@ -1,0 +1,79 @@
+"""Averages over neighbourhoods of a mesh."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import scipy.sparse as sp
+from jaxtyping import Array, Float, Int
+from scipy.sparse.csgraph import dijkstra
+
+from ..typing import pytree
+from ._topology import mesh_edges
+
+# Rows of shortest distances held at once.
+_CHUNK = 512
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class Stencil:
+    """A weighted mean of other rows for each row.
+
+    Attributes:
+        index: Rows taken, shape [rows, k].
+        weight: Their weights, which sum to 1, shape [rows, k].
+    """
+
+    index: Int[Array, "rows k"]
+    weight: Float[Array, "rows k"]
+
+    def __matmul__(self, values: Float[Array, "*batch rows channels"]) -> Array:
+        """The means, of the same shape as the values."""
+        # Whole rows of a batch are gathered at once: far fewer, longer copies.
+        rows = jnp.moveaxis(values, -2, 0)
+        wide = rows.reshape(rows.shape[0], -1)
+        out = jnp.zeros_like(wide)
+        for k in range(self.index.shape[1]):
+            out = out + self.weight[:, k, None] * wide[self.index[:, k]]
+        return jnp.moveaxis(out.reshape(rows.shape), 0, -2)
+
+
+def gaussian_stencil(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    radius: float,
+    *,
+    size: int = 16,
+) -> Stencil:
+    """Gaussian means over a mesh, by distance along its edges.
+
+    Args:
+        vertices: Positions [m].
+        faces: Triangles.
+        radius: Standard deviation [m]; vertices up to 2.2 of it away take part.
+        size: Vertices taken. Where more lie within reach, every so many are picked in
+            the order of distance; applying the stencil twice evens that out.
+
+    Returns:
+        The stencil; unconnected vertices keep their own value.
+    """
+    count = len(vertices)
+    edges = mesh_edges(faces).vertices
+    # An edge of length zero would read as none.
+    length = np.maximum(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 1e-9)
+    graph = sp.csr_matrix((length, (edges[:, 0], edges[:, 1])), (count, count))
+    index = np.repeat(np.arange(count, dtype=np.int32)[:, None], size, axis=1)
+    weight = np.zeros((count, size))
+    for start in range(0, count, _CHUNK):
+        rows = np.arange(start, min(start + _CHUNK, count))
+        far = dijkstra(graph, directed=False, indices=rows, limit=2.2 * radius)
+        for row, d in zip(rows, far, strict=True):
+            near = np.flatnonzero(np.isfinite(d))
+            near = near[np.argsort(d[near], kind="stable")]
+            if len(near) > size:
+                near = near[np.linspace(0, len(near) - 1, size).astype(int)]
+            index[row, : len(near)] = near
+            weight[row, : len(near)] = np.exp(-0.5 * (d[near] / radius) ** 2)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return Stencil(jnp.asarray(index), jnp.asarray(weight.astype(np.float32)))

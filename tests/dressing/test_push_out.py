@@ -1,0 +1,112 @@
+"""The last push-out: what is inside comes out on its own side, the rest stays."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.dressing import make_patch, push_out, skin_height, tuck_in, unbound_wearable
+from physxnet_jax.garment import template
+from physxnet_jax.models import skin_wearable
+from physxnet_jax.motion import clip_transforms, load_motion
+
+
+@pytest.fixture(scope="module")
+def balance(body, rest):
+    motion = load_motion("balance", fps=30.0)
+    return tuple(jnp.asarray(x[0]) for x in clip_transforms(body, rest, motion))
+
+
+@pytest.fixture(scope="module")
+def stride(body, rest):
+    """The frame of the walk in which the feet are farthest apart."""
+    world, shift = clip_transforms(body, rest, load_motion("walk", fps=30.0))
+    heads = np.asarray(rest)[np.asarray(body.joint_rows)].mean(axis=2)[:, 0]
+    left, right = (body.joint(f"{s}Foot") for s in ("Left", "Right"))
+    feet = [np.asarray(world)[:, j] @ heads[j] + np.asarray(shift)[:, j] for j in (left, right)]
+    frame = int(np.argmax(np.linalg.norm(feet[0] - feet[1], axis=1)))
+    return jnp.asarray(world[frame]), jnp.asarray(shift[frame])
+
+
+def fitted(body, rest, name):
+    g = template(name)
+    wearable = unbound_wearable(body, rest, g)
+    return wearable, make_patch(body, rest, wearable, g.mesh)
+
+
+def test_what_is_inside_is_lifted_and_nothing_else_is_touched(body, rest, balance):
+    wearable, patch = fitted(body, rest, "bottom")
+    x = skin_wearable(wearable, *balance)
+    height = skin_height(patch, x, *balance)[0]
+    clear = np.asarray(height > patch.least + 1e-4)
+    assert clear.any() and not clear.all()
+    same = push_out(patch, x, *balance)
+    np.testing.assert_array_equal(np.asarray(same)[clear], np.asarray(x)[clear])
+    # With a wanted height of a metre, the way is the skin's normal.
+    tall = dataclasses.replace(patch, least=jnp.ones_like(patch.least))
+    way = skin_height(tall, x, *balance)[1]
+    sunk = x - (height + 0.01)[:, None] * way / jnp.linalg.norm(way, axis=1, keepdims=True)
+    assert float(jnp.mean(skin_height(patch, sunk, *balance)[0])) < -0.005
+    lifted = push_out(patch, sunk, *balance)
+    after = np.asarray(skin_height(patch, lifted, *balance)[0])
+    assert np.mean(after > -1e-3) > 0.97
+
+
+def test_a_leg_that_comes_forward_carries_the_front_of_a_skirt(body, rest, stride):
+    wearable, patch = fitted(body, rest, "dress")
+    rows = np.asarray(patch.skirt.rows)
+    # A skirt that didn't follow the legs: it hangs from the hips alone.
+    hips = jnp.zeros_like(wearable.skin).at[:, body.joint("Hips")].set(1.0)
+    stiff = skin_wearable(dataclasses.replace(wearable, skin=hips), *stride)
+    before = np.asarray(skin_height(patch, stiff, *stride)[0])[rows]
+    assert np.mean(before < 0) > 0.02
+    moved = push_out(patch, stiff, *stride)
+    after = np.asarray(skin_height(patch, moved, *stride)[0])[rows]
+    assert np.mean(after < 0) < 0.002 < np.mean(before < 0)
+    # The front stays the front: no vertex is pushed through to the other side.
+    gap = np.asarray(moved - stiff)[rows]
+    outward = np.asarray(patch.skirt.outward)
+    forward = np.abs(outward[:, 2]) > 0.8
+    far = forward & (np.linalg.norm(gap, axis=1) > 0.03)
+    turned = np.asarray(stride[0])[body.joint("Hips")]
+    side = np.sum(gap * (outward @ turned.T), axis=1)
+    assert far.sum() > 20 and np.mean(side[far] > 0) > 0.95
+
+
+def test_gradients_through_a_skirt_in_a_stride_are_finite(body, rest, stride):
+    wearable, patch = fitted(body, rest, "dress")
+    x = skin_wearable(wearable, *stride)
+
+    def height(points, rotations):
+        return jnp.mean(push_out(patch, points, rotations, stride[1]) ** 2)
+
+    for g in jax.grad(height, argnums=(0, 1))(x, stride[0]):
+        assert np.isfinite(np.asarray(g)).all() and np.abs(np.asarray(g)).max() > 0
+
+
+def test_long_edges_stand_off_farther(body, rest):
+    g = template("bottom")
+    wearable = unbound_wearable(body, rest, g)
+    fine = make_patch(body, rest, wearable, g.mesh).least
+    far = np.asarray(g.mesh.vertices)
+    # The same vertices with a few triangles over 10 cm.
+    distance = np.linalg.norm(far - far[0], axis=1)
+    near_by = np.argsort(np.abs(distance - 0.1))[:2]
+    wide = g.mesh.replace(
+        faces=jnp.concatenate([g.mesh.faces, jnp.asarray([[0, *near_by]], jnp.int32)])
+    )
+    coarse = make_patch(body, rest, wearable, wide).least
+    assert float(coarse[0]) == pytest.approx(0.02, abs=1e-4)
+    assert float(fine[0]) < 0.008
+    changed = np.flatnonzero(np.asarray(coarse != fine))
+    assert set(changed) <= {0, *near_by.tolist()}
+
+
+def test_tucking_in_leaves_room_between_least_and_most(body, rest):
+    pairs = [fitted(body, rest, t) for t in ("top", "bottom")]
+    coarse = [dataclasses.replace(p, least=p.least + 0.01) for _, p in pairs]
+    top, bottom = tuck_in(coarse, [w for w, _ in pairs])
+    assert bool((bottom.most >= bottom.least).all())
+    assert float(top.least.min()) > float(bottom.least.max())

@@ -1,0 +1,58 @@
+"""Means over neighbourhoods: what they keep, and where they stop."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.geometry import Stencil, gaussian_stencil, spread_points
+
+
+def sheet(n, step=0.01):
+    y, x = np.mgrid[:n, :n] * step
+    v = np.column_stack([x.ravel(), y.ravel(), np.zeros(n * n)])
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (q.ravel() for q in (i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]))
+    return v, np.concatenate([np.column_stack([a, b, c]), np.column_stack([b, d, c])])
+
+
+def test_constants_stay_and_noise_shrinks():
+    v, f = sheet(20)
+    s = gaussian_stencil(v, f, 0.03)
+    np.testing.assert_allclose(np.asarray(s.weight.sum(axis=1)), 1.0, atol=1e-6)
+    one = jnp.ones((3, len(v), 2))
+    np.testing.assert_allclose(np.asarray(s @ one), 1.0, atol=1e-6)
+    noise = np.random.default_rng(0).normal(size=(len(v), 1)).astype(np.float32)
+    assert float(jnp.std(s @ (s @ jnp.asarray(noise)))) < 0.3
+
+
+def test_a_batch_is_a_loop_over_its_members():
+    v, f = sheet(8)
+    s = gaussian_stencil(v, f, 0.02)
+    x = jnp.asarray(np.random.default_rng(1).normal(size=(4, len(v), 3)).astype(np.float32))
+    each = jnp.stack([s @ row for row in x])
+    np.testing.assert_allclose(np.asarray(s @ x), np.asarray(each), atol=1e-6)
+
+
+def test_another_sheet_close_by_takes_no_part():
+    v, f = sheet(6)
+    both = np.concatenate([v, v + [0.0, 0.0, 0.001]])
+    s = gaussian_stencil(both, np.concatenate([f, f + len(v)]), 0.03)
+    values = jnp.concatenate([jnp.zeros((len(v), 1)), jnp.ones((len(v), 1))])
+    np.testing.assert_allclose(np.asarray(s @ values), np.asarray(values), atol=1e-6)
+
+
+def test_lonely_vertices_keep_their_value_and_coincident_ones_share_it():
+    v = np.zeros((4, 3))
+    s = gaussian_stencil(v, np.array([[0, 1, 2]]), 0.01)
+    out = np.asarray(s @ jnp.asarray([[0.0], [3.0], [6.0], [9.0]]))
+    np.testing.assert_allclose(out.ravel(), [3.0, 3.0, 3.0, 9.0], atol=1e-5)
+    assert isinstance(s, Stencil)
+
+
+@pytest.mark.parametrize("spacing", [0.05, 0.3])
+def test_spread_points_are_apart_and_cover_the_rest(spacing):
+    p = np.random.default_rng(2).uniform(size=(300, 3))
+    chosen = p[spread_points(p, spacing)]
+    gaps = np.linalg.norm(chosen[:, None] - chosen[None], axis=2) + np.eye(len(chosen))
+    assert gaps.min() > spacing * (1 - 1e-9)
+    assert np.linalg.norm(p[:, None] - chosen[None], axis=2).min(axis=1).max() <= spacing
