@@ -9,8 +9,8 @@ import pytest
 
 from physxnet_jax.body import load_body
 from physxnet_jax.errors import SimulationError
-from physxnet_jax.garment import COTTON, Garment, template
-from physxnet_jax.geometry import make_mesh, mesh_edges
+from physxnet_jax.garment import free_garment, square_sheet, template
+from physxnet_jax.geometry import mesh_edges
 from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import (
     XPBD,
@@ -26,62 +26,31 @@ from physxnet_jax.simulation import (
     lead_in,
     prepare_scene,
     simulate,
+    simulate_still,
 )
 
 FPS = 30.0
 
 
-def sheet(n=6, size=0.3, pinned=None, height=0.0):
-    """A square sheet in the air in front of the body, as a garment."""
-    x, y = np.meshgrid(np.linspace(0, size, n), np.linspace(0, size, n))
-    v = np.column_stack([x.ravel(), height + 0 * x.ravel(), 1.5 + y.ravel()])
-    k = np.arange(n * n).reshape(n, n)
-    a, b, c, d = (q.ravel() for q in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
-    # Rows of the grid run along z: this order makes normals point up.
-    f = np.concatenate([np.column_stack([a, c, b]), np.column_stack([a, d, c])])
-    body = load_body()
-    held = np.zeros(n * n, bool)
-    if pinned is not None:
-        held[pinned] = True
-    skin = np.zeros((n * n, 31), np.float32)
-    skin[:, 0] = 1
-    refs = jnp.zeros((n * n, 1), jnp.int32)
-    first = np.asarray(body.rest_vertices(body.default_shape()))[0]
-    return Garment(
-        make_mesh(v, f),
-        jnp.asarray(held),
-        refs,
-        jnp.ones((n * n, 1), jnp.float32),
-        jnp.asarray((v - first).astype(np.float32)),
-        jnp.asarray(skin),
-        COTTON,
-        "top",
-        "sheet",
-    )
+def sheet(n=6, size=0.3, pinned=None):
+    return square_sheet(n, size, pinned=pinned)
 
 
 def still(frames):
+    """The body's rest pose, frame after frame."""
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
     pose = jnp.repeat(body.a_pose()[None, None], frames + 1, axis=0)
     root = jnp.repeat(body.joint_positions(rest)[0][:1][None], frames + 1, axis=0)
-    return body, rest, pose, root
+    return pose, root
 
 
-def roll(garment, effects, frames, solver=None, start=None, shift=None):
-    """Positions of every frame, with the body standing still."""
+def roll(garment, effects, frames, solver=None, start=None, shift=(0.0, 0.0, 0.0)):
+    """Positions of every frame, with the body standing still, and diagnostics."""
     scene = prepare_scene(Scene((garment,), effects))
-    body, rest, pose, root = still(frames)
-    if shift is not None:
-        root = root + shift[None]
-    x = jnp.asarray(scene.assembly.rest.astype(np.float32)) if start is None else start
-    if shift is not None:
-        x = x + shift
-    state = State(x[:, :, None], jnp.zeros((*x.shape, 1)))
-    state, moved, info = advance(
-        body, rest, scene.effects, state, pose, root, solver=solver or XPBD(16, 2), fps=FPS
-    )
-    return np.asarray(moved)[..., 0], {k: np.asarray(v)[:, 0] for k, v in info.items()}
+    start = None if start is None else np.asarray(start)
+    out = simulate_still(scene, frames, solver=solver or XPBD(16, 2), start=start, shift=shift)
+    return out.positions[0], out.diagnostics
 
 
 def test_free_fall_is_exact_to_the_order_of_the_step():
@@ -146,7 +115,7 @@ def test_far_from_the_origin_nothing_changes_beyond_rounding():
     g = sheet(5)
     effects = (Gravity(), Stretch(), Bend())
     here = roll(g, effects, 10)[0][-1]
-    shift = jnp.array([[100.0, 0.0, -50.0]])
+    shift = (100.0, 0.0, -50.0)
     there = roll(g, effects, 10, shift=shift)[0][-1] - np.asarray(shift)
     assert np.abs(here - there).max() < 4 * np.spacing(np.float32(100.0)) * 10
 
@@ -156,14 +125,15 @@ def test_an_absent_effect_leaves_no_trace(effect):
     """Neither body nor effect is in the program of a scene that doesn't call for them."""
     g = sheet(4)
     scene = prepare_scene(Scene((g,), (effect,)))
-    body, rest, pose, root = still(1)
+    pose, root = still(1)
     x = jnp.asarray(scene.assembly.rest.astype(np.float32))[:, :, None]
 
     def program(effects):
+        system = dataclasses.replace(scene.system(XPBD()), effects=effects)
         return str(
-            jax.make_jaxpr(
-                lambda s: advance(body, rest, effects, s, pose, root, solver=XPBD(4, 1), fps=FPS)
-            )(State(x, jnp.zeros_like(x)))
+            jax.make_jaxpr(lambda s: advance(system, s, pose, root, solver=XPBD(4, 1), fps=FPS))(
+                State(x, jnp.zeros_like(x))
+            )
         )
 
     with_it, without = program(scene.effects), program(())
@@ -214,14 +184,13 @@ def test_batches_agree_with_single_runs():
 def test_gradients_through_the_simulation_are_finite_and_right():
     g = sheet(4, pinned=np.arange(4))
     scene = prepare_scene(Scene((g,), (Gravity(), Stretch(), Bend(), Pin())))
-    body, rest, pose, root = still(2)
+    pose, root = still(2)
+    system = scene.system(XPBD())
     x = jnp.asarray(scene.assembly.rest.astype(np.float32))[:, :, None]
 
     def height(lift):
         state = State(x, jnp.zeros_like(x).at[:, 1].set(lift))
-        _, moved, _ = advance(
-            body, rest, scene.effects, state, pose, root, solver=XPBD(8, 1), fps=FPS
-        )
+        _, moved, _ = advance(system, state, pose, root, solver=XPBD(8, 1), fps=FPS)
         return moved[-1, :, 1].mean()
 
     slope = jax.grad(height)(jnp.float32(0.2))
@@ -233,19 +202,7 @@ def test_gradients_through_the_simulation_are_finite_and_right():
 def test_degenerate_cloth_stays_finite():
     """Duplicate vertices, a triangle without area, an isolated vertex."""
     v = [[0, 0, 1.5], [0.1, 0, 1.5], [0, 0, 1.6], [0, 0, 1.5], [0.3, 0.3, 1.5], [0.05, 0, 1.5]]
-    g = sheet(4)
-    mesh = make_mesh(v, [[0, 1, 2], [0, 3, 1], [0, 5, 1]])
-    n = len(v)
-    first = np.asarray(load_body().rest_vertices(load_body().default_shape()))[0]
-    bad = dataclasses.replace(
-        g,
-        mesh=mesh,
-        pinned=jnp.zeros((n,), bool),
-        refs=jnp.zeros((n, 1), jnp.int32),
-        ref_weights=jnp.ones((n, 1)),
-        offset=jnp.asarray(np.asarray(v, np.float32) - first),
-        skin=g.skin[:n],
-    )
+    bad = free_garment(np.asarray(v), np.asarray([[0, 1, 2], [0, 3, 1], [0, 5, 1]]))
     moved, info = roll(bad, (Gravity(), Stretch(), Bend()), 10)
     assert info["finite"].all()
     assert np.abs(moved[-1] - np.asarray(v)).max() < 1.0

@@ -7,12 +7,14 @@ from ._fit import (
 )
 from ._garment import (
     COTTON as COTTON,
+    FABRICS as FABRICS,
     TEMPLATES as TEMPLATES,
     Fabric as Fabric,
     Garment as Garment,
     Template as Template,
     carried_weights as carried_weights,
 )
+from ._sheet import free_garment as free_garment, square_sheet as square_sheet
 from ._templates import (
     build_template as build_template,
     stored_arrays as stored_arrays,

@@ -1,8 +1,11 @@
 """The cloth simulator: scenes of effects, solvers, rollouts. Knows nothing of UV maps."""
 
-from ._effect import Effect as Effect, Prepared as Prepared
+from ._advance import advance as advance
+from ._diagnostics import Rollout as Rollout, Status as Status
+from ._effect import Clock as Clock, Effect as Effect, Prepared as Prepared
+from ._implicit import Implicit as Implicit
 from ._rollout import (
-    Rollout as Rollout,
+    ACCURACY as ACCURACY,
     lead_in as lead_in,
     simulate as simulate,
     simulate_batch as simulate_batch,
@@ -13,12 +16,20 @@ from ._scene import (
     Scene as Scene,
     prepare_scene as prepare_scene,
 )
-from ._xpbd import XPBD as XPBD, State as State, advance as advance
+from ._solver import Solver as Solver
+from ._state import State as State, System as System
+from ._still import simulate_still as simulate_still
+from ._verlet import Verlet as Verlet
+from ._xpbd import XPBD as XPBD
 from .effects import (
+    Air as Air,
     Bend as Bend,
     BodyContact as BodyContact,
     Damping as Damping,
+    Dihedral as Dihedral,
     Gravity as Gravity,
+    Membrane as Membrane,
     Pin as Pin,
+    StrainLimit as StrainLimit,
     Stretch as Stretch,
 )

@@ -5,8 +5,9 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
 
-from ..body import Body
+from ..body import NUM_BODY_VERTICES, Body
 from ..garment import Garment
 
 
@@ -26,6 +27,7 @@ class Assembly:
         friction: Coulomb coefficient [1], shape [vertices].
         stretch: Membrane stiffness of faces [N/m], shape [faces].
         bend: Bending stiffness of faces [N m], shape [faces].
+        membrane: Stiffness along warp, weft and in shear [N/m], shape [faces, 3].
         loose: Vertices that may meet any limb (skirts), shape [vertices].
         parts: First vertex of every garment, and the total at the end.
     """
@@ -41,6 +43,7 @@ class Assembly:
     friction: Float[np.ndarray, " vertices"]
     stretch: Float[np.ndarray, " faces"]
     bend: Float[np.ndarray, " faces"]
+    membrane: Float[np.ndarray, "faces 3"]
     loose: Bool[np.ndarray, " vertices"]
     parts: tuple[int, ...]
 
@@ -50,7 +53,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
     rest_body = body.rest_vertices(shape)
     rest, faces, mass, pinned, weights = [], [], [], [], []
     per_vertex: dict[str, list] = {"thickness": [], "friction": []}
-    per_face: dict[str, list] = {"stretch": [], "bend": []}
+    per_face: dict[str, list] = {"stretch": [], "bend": [], "membrane": []}
     loose = []
     parts = [0]
     for g in garments:
@@ -72,7 +75,8 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         per_vertex["friction"].append(np.full(len(x), g.fabric.friction))
         per_face["stretch"].append(np.full(len(f), g.fabric.stretch))
         per_face["bend"].append(np.full(len(f), g.fabric.bend))
-        loose.append(np.full(len(x), g.template == "dress"))
+        per_face["membrane"].append(np.tile(g.fabric.membrane, (len(f), 1)))
+        loose.append(_hanging(g, x, np.asarray(rest_body, np.float64)))
         parts.append(parts[-1] + len(x))
     cat = np.concatenate
     return Assembly(
@@ -87,6 +91,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         cat(per_vertex["friction"]),
         cat(per_face["stretch"]),
         cat(per_face["bend"]),
+        cat(per_face["membrane"]),
         cat(loose),
         tuple(parts),
     )
@@ -95,3 +100,19 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
 def float32(x: np.ndarray) -> Array:
     """A device array in the simulation's precision."""
     return jnp.asarray(np.asarray(x, dtype=np.float32))
+
+
+# Cloth farther than this from the skin hangs [m].
+_HANGS = 0.025
+
+
+def _hanging(
+    garment: Garment, x: Float[np.ndarray, "vertices 3"], rest_body: Float[np.ndarray, "all 3"]
+) -> Bool[np.ndarray, " vertices"]:
+    """Vertices that may meet any limb: of a skirt, or far from the skin."""
+    far = KDTree(rest_body[:NUM_BODY_VERTICES]).query(x)[0] > _HANGS
+    if garment.template != "dress":
+        return far
+    # A skirt hangs from where it leaves the body down to its hem.
+    top = x[far, 1].max() if far.any() else -np.inf
+    return far | (x[:, 1] < top)

@@ -1,9 +1,10 @@
 """What an effect is: an entry of a scene that leaves no trace when absent."""
 
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar
 
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, Float, Int
 
 from ..typing import pytree
 from ._assembly import Assembly
@@ -39,6 +40,20 @@ class Placed:
     normals: Float[Array, "points 3 batch"]
 
 
+@pytree
+@dataclasses.dataclass(frozen=True)
+class Clock:
+    """When a block takes place.
+
+    Attributes:
+        time: Since the clip's first frame, at the block's start [s].
+        length: Of the block [s].
+    """
+
+    time: Float[Array, ""]
+    length: float = dataclasses.field(metadata={"static": True})
+
+
 class Prepared:
     """An effect made ready for a scene: a pytree with hooks that default to nothing.
 
@@ -48,25 +63,67 @@ class Prepared:
     minor axis everywhere: gathers move whole rows, element-wise work is contiguous.
     """
 
+    # Whether it stores energy; what doesn't is projected by every solver.
+    elastic: ClassVar[bool] = False
+    # Whether it prescribes where vertices are.
+    holds: ClassVar[bool] = False
+
     @property
     def attached(self) -> Attached | None:
         """Points to be skinned for this effect, if it needs any."""
         return None
 
-    def accelerate(
-        self, velocity: Float[Array, "vertices 3 batch"], h: float
-    ) -> Float[Array, "vertices 3 batch"]:
-        """Velocities [m/s] after external forces have acted for ``h`` [s]."""
-        return velocity
+    def initial(self, batch: int) -> Any:
+        """What the effect remembers before the first block (a pytree)."""
+        return ()
 
-    def begin(self, base: Float[Array, "vertices 3 batch"], start: Any, end: Any) -> Any:
-        """What `project` needs for a block (a pytree; None for nothing).
+    def keep(self, context: Any) -> Any:
+        """What it remembers for the next block, of the same structure."""
+        return ()
+
+    def begin(
+        self,
+        base: Float[Array, "vertices 3 batch"],
+        start: Any,
+        end: Any,
+        clock: Clock,
+        memory: Any,
+    ) -> Any:
+        """What the other hooks need for a block (a pytree; None for nothing).
 
         Args:
             base: Cloth positions at the block's start [m].
             start: The attached points at the block's start, a `Placed` or None.
             end: The same at its end.
+            clock: Time at the block's start.
+            memory: What `keep` returned for the block before.
         """
+        return None
+
+    def accelerate(
+        self, velocity: Float[Array, "vertices 3 batch"], context: Any, h: float
+    ) -> Float[Array, "vertices 3 batch"]:
+        """Velocities [m/s] after external forces have acted for ``h`` [s]."""
+        return velocity
+
+    def energy(
+        self, displacement: Float[Array, "vertices 3 batch"], context: Any
+    ) -> Float[Array, " batch"] | None:
+        """Stored energy [J], differentiable; None for effects that store none."""
+        return None
+
+    def coupled(self) -> Int[np.ndarray, "blocks 2"]:
+        """Pairs of vertices that the energy's second derivative couples."""
+        return np.zeros((0, 2), np.int64)
+
+    def hessian(
+        self, displacement: Float[Array, "vertices 3 batch"], context: Any
+    ) -> Float[Array, "blocks batch 3 3"] | None:
+        """Its blocks [N/m], made positive semidefinite, in the order of `coupled`."""
+        return None
+
+    def constant_stiffness(self) -> Float[np.ndarray, " blocks"] | None:
+        """Blocks that are constant multiples of the identity [N/m], likewise."""
         return None
 
     def project(

@@ -3,42 +3,24 @@
 import dataclasses
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from ..body import Body
 from ..errors import SimulationError
 from ..motion import Motion, animate
+from ._advance import advance
 from ._assembly import float32
+from ._diagnostics import Rollout
 from ._scene import PreparedScene, Scene, prepare_scene
-from ._xpbd import XPBD, State, advance
+from ._solver import Solver
+from ._state import State
+from ._xpbd import XPBD
 
 # Frames compiled together: clips of any length are cut into blocks of this many.
 _BLOCK = 10
-
-
-@dataclasses.dataclass(frozen=True)
-class Rollout:
-    """What a rollout gives.
-
-    Attributes:
-        positions: Cloth positions of every garment [m], shapes [frames, vertices, 3].
-        fps: Frames a second.
-        diagnostics: Values of each frame: ``finite``, ``speed_max`` [m/s], and what
-            the scene's effects add: ``strain_max``, ``strain_p99`` [1],
-            ``penetration_max`` [m], ``inside_share`` [1].
-    """
-
-    positions: tuple[Float[np.ndarray, "frames vertices 3"], ...]
-    fps: float
-    diagnostics: dict[str, np.ndarray]
-
-    @property
-    def finite(self) -> Bool[np.ndarray, " frames"]:
-        """Which frames hold no NaN and no infinity."""
-        return self.diagnostics["finite"].astype(bool)
 
 
 def lead_in(body: Body, motion: Motion, *, seconds: float = 1.5, settle: float = 0.4) -> Motion:
@@ -74,12 +56,22 @@ def lead_in(body: Body, motion: Motion, *, seconds: float = 1.5, settle: float =
     return Motion(float32(rotations), jnp.asarray(root), motion.fps, f"{motion.name} lead-in")
 
 
+ACCURACY: dict[str, Solver] = {
+    "draft": XPBD(substeps=16, queries=2),
+    "standard": XPBD(substeps=32, queries=4),
+    "fine": XPBD(substeps=128, queries=8),
+}
+"""The one knob: what each step costs and brings stands in docs/accuracy-cost.md."""
+
+
 def simulate(
     scene: Scene,
     motion: Motion,
     *,
-    solver: XPBD | None = None,
+    accuracy: str = "standard",
+    solver: Solver | None = None,
     progress: Callable[[int, int], None] | None = None,
+    energies: bool = False,
     throw: bool = True,
 ) -> Rollout:
     """Simulates a scene through a motion.
@@ -87,25 +79,31 @@ def simulate(
     Args:
         scene: Garments, body and effects.
         motion: The body's motion.
-        solver: Substeps and queries; `XPBD` by default.
+        accuracy: ``draft``, ``standard`` or ``fine``, see `ACCURACY`.
+        solver: A solver set by hand, instead.
         progress: Called with frames done and frames in all.
-        throw: Raise if a frame isn't finite; otherwise the flag is in the result.
+        energies: Put the energy of each effect into the diagnostics.
+        throw: Raise if a frame isn't finite; otherwise the status tells.
 
     Returns:
         Positions of each garment in every frame, and diagnostics. The lead-in from
         the rest pose is simulated and left out.
 
     Raises:
-        SimulationError: A frame that isn't finite (its number is named).
+        SimulationError: A frame that isn't finite; its number, the vertex and the
+            likely cause are named.
     """
-    results = simulate_batch(prepare_scene(scene), [motion], solver=solver, progress=progress)
-    out = results[0]
-    if throw and not out.finite.all():
-        frame = int(np.argmin(out.finite))
-        raise SimulationError(
-            f"{motion.name}: frame {frame} is not finite. Try more substeps; look for"
-            " a teleport in the motion or degenerate triangles in the garment."
-        )
+    if accuracy not in ACCURACY:
+        raise SimulationError(f"No accuracy '{accuracy}'; there are {', '.join(ACCURACY)}.")
+    out = simulate_batch(
+        prepare_scene(scene),
+        [motion],
+        solver=ACCURACY[accuracy] if solver is None else solver,
+        progress=progress,
+        energies=energies,
+    )[0]
+    if throw:
+        out.check()
     return out
 
 
@@ -113,27 +111,44 @@ def simulate_batch(
     scene: PreparedScene,
     motions: list[Motion],
     *,
-    solver: XPBD | None = None,
+    solver: Solver | None = None,
     progress: Callable[[int, int], None] | None = None,
+    energies: bool = False,
 ) -> list[Rollout]:
     """Several motions side by side; each result is cut to its motion's length.
 
     Args:
         scene: The scene, prepared.
         motions: Clips of one frame rate. Shorter ones hold their last pose.
-        solver: Substeps and queries.
+        solver: How the cloth moves; ``standard`` by default.
         progress: Called with frames done and frames in all.
+        energies: Put the energy of each effect into the diagnostics.
 
     Returns:
         One rollout a motion.
 
     Raises:
-        SimulationError: Motions of different frame rates.
+        SimulationError: No motion, or motions of different frame rates.
     """
-    solver = XPBD() if solver is None else solver
+    if not motions:
+        raise SimulationError("No motion to simulate; give at least one.")
+    solver = ACCURACY["standard"] if solver is None else solver
+    # Only around what is traced and run: the rest of the process keeps its precision.
+    with jax.enable_x64(solver.precision == "float64"):
+        return _roll(scene, motions, solver, progress, energies)
+
+
+def _roll(
+    scene: PreparedScene,
+    motions: list[Motion],
+    solver: Solver,
+    progress: Callable[[int, int], None] | None,
+    energies: bool,
+) -> list[Rollout]:
     fps = motions[0].fps
     if any(m.fps != fps for m in motions):
         raise SimulationError("Motions of one batch need one frame rate: resample them.")
+    system = scene.system(solver)
     body = scene.assembly.body
     rest = float32(scene.assembly.rest_body)
     leads = [lead_in(body, m) for m in motions]
@@ -149,7 +164,7 @@ def simulate_batch(
             rows.append(x[np.minimum(np.arange(total), len(x) - 1)])
         return np.stack(rows, axis=1)
 
-    rotations, root = stack("rotations"), stack("root")
+    rotations, root = (stack(n).astype(solver.precision) for n in ("rotations", "root"))
     start = [
         animate(
             body,
@@ -160,20 +175,25 @@ def simulate_batch(
         )[0]
         for lead in leads
     ]
-    x = jnp.stack(start, axis=2)
+    x = jnp.stack(start, axis=2).astype(solver.precision)
     state = State(x, jnp.zeros_like(x))
+    state = dataclasses.replace(
+        state, memory=solver.remember(state.velocity, 1.0 / (fps * solver.substeps))
+    )
+    # Time zero is the clip's first frame, whatever the lead-in's length.
+    began = -(skipped - 1) / fps
     positions, diagnostics = [np.asarray(x)[None]], []
     for at in range(0, total - 1, _BLOCK):
         part = slice(at, at + _BLOCK + 1)
         state, moved, info = advance(
-            body,
-            rest,
-            scene.effects,
+            system,
             state,
             jnp.asarray(rotations[part]),
             jnp.asarray(root[part]),
             solver=solver,
             fps=fps,
+            time=jnp.asarray(began + at / fps, solver.precision),
+            energies=energies,
         )
         positions.append(np.asarray(moved))
         diagnostics.append({k: np.asarray(v) for k, v in info.items()})
@@ -192,6 +212,7 @@ def simulate_batch(
                 tuple(np.ascontiguousarray(every[frames, i:j, :, b]) for i, j in garments),
                 fps,
                 {k: v[flags, b] for k, v in values.items()},
+                m.name,
             )
         )
     return out

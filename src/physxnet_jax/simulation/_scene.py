@@ -1,7 +1,9 @@
 """Scenes: garments on a body, and the effects that act."""
 
 import dataclasses
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -9,8 +11,10 @@ from jaxtyping import Array, Float
 from ..body import Body, load_body
 from ..errors import SimulationError
 from ..garment import Garment
-from ._assembly import Assembly, assemble
+from ._assembly import Assembly, assemble, float32
 from ._effect import Effect, Prepared
+from ._solver import Solver
+from ._state import System
 from .effects import Bend, BodyContact, Damping, Gravity, Pin, Stretch
 
 STANDARD: tuple[Effect, ...] = (
@@ -44,10 +48,38 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class PreparedScene:
-    """A scene ready to roll: host tables and device arrays."""
+    """A scene ready to roll: host tables and device arrays.
+
+    Attributes:
+        assembly: Garments as one set of particles, on the host.
+        effects: Prepared effects.
+        inverse_mass: [1/kg], 0 where held, shape [vertices, 1, 1].
+    """
 
     assembly: Assembly
     effects: tuple[Prepared, ...]
+    inverse_mass: Float[Array, "vertices 1 1"]
+
+    def system(self, solver: Solver) -> System:
+        """The scene on the device, in the solver's precision."""
+        system = System(
+            self.assembly.body,
+            float32(self.assembly.rest_body),
+            self.effects,
+            self.inverse_mass,
+            solver.prepare(self),
+        )
+        return cast(system, solver.precision)
+
+
+def cast(tree: Any, precision: str) -> Any:
+    """Floating arrays of a pytree in another precision."""
+    dtype = jnp.dtype(precision)
+
+    def one(x: Any) -> Any:
+        return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+    return jax.tree.map(one, tree)
 
 
 def prepare_scene(scene: Scene) -> PreparedScene:
@@ -71,4 +103,4 @@ def prepare_scene(scene: Scene) -> PreparedScene:
     inverse = np.where(held, 0.0, 1.0 / assembly.mass)
     inverse_mass = jnp.asarray(inverse.astype(np.float32))
     prepared = tuple(e.prepare(assembly, inverse_mass) for e in scene.effects)
-    return PreparedScene(assembly, prepared)
+    return PreparedScene(assembly, prepared, inverse_mass[:, None, None])

@@ -1,8 +1,12 @@
 """Effects, one file each. A scene holds the ones it calls for and nothing else."""
 
+from ._air import Air as Air
 from ._bend import Bend as Bend
 from ._contact import BodyContact as BodyContact
 from ._damping import Damping as Damping
+from ._dihedral import Dihedral as Dihedral
 from ._gravity import Gravity as Gravity
+from ._membrane import Membrane as Membrane
 from ._pin import Pin as Pin
+from ._strain_limit import StrainLimit as StrainLimit
 from ._stretch import Stretch as Stretch

@@ -12,7 +12,7 @@ from ...body import NUM_BODY_VERTICES, Body, triangulate
 from ...geometry import closest_barycentric, spread_points, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Attached, Effect, Placed, Prepared
+from .._effect import Attached, Clock, Effect, Placed, Prepared
 
 # Groups of joints between which a tight garment doesn't slide.
 _LIMBS = {
@@ -41,58 +41,122 @@ _LIMBS = {
 class BodyContact(Effect):
     """Cloth keeps its thickness from the skin and rubs against it.
 
-    Once a block, each cloth vertex finds its closest skin point: the nearest of a list
-    of patch centres, then the exact closest point on that patch's triangles. Within
-    the block the point and its normal move with the skin. Patches of other limbs are
-    left out, so that nothing grabs across the crotch; skirts may meet both legs.
+    Once a block, each cloth vertex finds its closest skin point; within the block the
+    point and its normal move with the skin, and the half space beyond them is closed,
+    however fast the limb: nothing tunnels.
+
+    Cloth that lies on the skin *tracks* it: the search starts at the skin point of the
+    block before and walks over the surface, so the cloth may slide any distance but never
+    jumps to the far side of a limb, to another limb, or across a fold where the body
+    passes through itself. Cloth pinched between two limbs keeps to its own. Hanging
+    cloth compares a list of patches over all limbs within reach instead.
 
     Attributes:
-        centres: Patch centres compared for each vertex.
-        spacing: Distance between centres [m].
-        patch: Triangles of a patch.
-        push: Largest correction in one substep [m]: pinched cloth is squeezed out
-            gently instead of being shot away.
+        patch: Triangles around a skin vertex that are compared exactly.
+        hops: Steps of the walk a block; each reaches about two centimetres.
+        centres: Patches in the list of a hanging vertex.
+        spacing: Distance between them [m].
+        push: Largest correction in one substep [m].
+        leave: Cloth that was lifted leaves the skin no faster than this [m/s]: what was
+            squeezed into a limb is set down outside instead of being shot away.
 
     References:
         Macklin et al. (2016) for the projection; friction as a clamped tangential
         move, Mueller et al., Position based dynamics (2007), section 3.4.
     """
 
-    centres: int = 96
-    spacing: float = 0.016
     patch: int = 24
-    push: float = 0.004
+    hops: int = 2
+    centres: int = 96
+    spacing: float = 0.026
+    push: float = 1.0
+    leave: float = 1.0
+
+    def __post_init__(self) -> None:
+        if min(self.patch, self.hops, self.centres) < 1 or self.spacing <= 0 or self.push <= 0:
+            raise ValueError(f"{self}: patch, hops, centres, spacing and push must be positive.")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Lists the patch centres of every cloth vertex."""
+        """Patches around skin vertices, and where each cloth vertex starts."""
         body = assembly.body
         skin = assembly.rest_body[:NUM_BODY_VERTICES]
         faces = np.asarray(triangulate(body.quads))
-        label = _limb_labels(np.asarray(body.weights)[:NUM_BODY_VERTICES], body)
-        candidates, table = _patches(
-            assembly, skin, faces, label, self.centres, self.spacing, self.patch
+        weights = np.asarray(body.weights)[:NUM_BODY_VERTICES]
+        label = _limb_labels(weights, body)
+        loose = np.flatnonzero(assembly.loose)
+        tight = np.flatnonzero(~assembly.loose)
+        # Only skin that cloth can get to takes part: far parts are not even skinned.
+        reach = KDTree(assembly.rest).query(skin, distance_upper_bound=_REACH)[0]
+        used = np.flatnonzero(np.isfinite(reach))
+        if len(used) < 3 * self.patch:
+            used = np.arange(len(skin))
+        start = _start(assembly, skin, used, label, tight)
+        listed = _listed(assembly, skin, used, loose, self.spacing, self.centres)
+        kept = np.flatnonzero(np.isin(faces, used).all(axis=1))
+        size = min(self.patch, len(kept))
+        far, near = KDTree(skin[faces[kept]].mean(axis=1)).query(skin[used], k=size)
+        local = np.zeros(len(skin), dtype=np.int32)
+        local[used] = np.arange(len(used))
+        normals = vertex_normals(float32(skin), jnp.asarray(faces))
+        attached = Attached(
+            float32(skin[used]), normals[jnp.asarray(used)], body.weights[jnp.asarray(used)]
         )
         w = np.asarray(inverse_mass)
-        used = np.unique(candidates)
-        rows = np.unique(faces[table[used]])
-        local = np.zeros(len(skin), dtype=np.int32)
-        local[rows] = np.arange(len(rows))
-        mesh_normals = vertex_normals(float32(skin), jnp.asarray(faces))
-        attached = Attached(
-            float32(skin[rows]),
-            mesh_normals[jnp.asarray(rows)],
-            body.weights[jnp.asarray(rows)],
-        )
         return _Contact(
             attached,
-            jnp.asarray(local[candidates]),
-            jnp.asarray(table[rows]),
-            jnp.asarray(local[faces]),
+            jnp.asarray(near.reshape(len(used), size).astype(np.int32)),
+            float32(far.reshape(len(used), size)[:, -1]),
+            jnp.asarray(local[faces[kept]]),
+            jnp.asarray(tight.astype(np.int32)),
+            jnp.asarray(loose.astype(np.int32)),
+            jnp.asarray(local[start]),
+            jnp.asarray(local[listed]),
             float32(assembly.thickness)[:, None],
             float32(assembly.friction)[:, None],
             float32(w > 0)[:, None],
             self.push,
+            self.leave,
+            self.hops,
         )
+
+
+# Cloth this little above its thickness touches the skin [m].
+_NEAR = 0.001
+# Skin farther than this from all cloth at rest takes no part [m].
+_REACH = 0.30
+
+
+def _start(
+    assembly: Assembly,
+    skin: Float[np.ndarray, "body 3"],
+    used: Int[np.ndarray, " used"],
+    label: Int[np.ndarray, " body"],
+    rows: Int[np.ndarray, " tight"],
+) -> Int[np.ndarray, " tight"]:
+    """The skin vertex nearest to each cloth vertex at rest, on its own limb."""
+    cloth = _limb_labels(assembly.weights, assembly.body)[rows]
+    out = np.zeros(len(rows), dtype=np.int64)
+    for lab in np.unique(cloth):
+        mine = cloth == lab
+        # Arms and legs keep to themselves; the trunk's cloth may start anywhere.
+        pool = used if lab == 0 else used[(label[used] == lab) | (label[used] == 0)]
+        pool = pool if len(pool) else used
+        out[mine] = pool[KDTree(skin[pool]).query(assembly.rest[rows[mine]])[1]]
+    return out
+
+
+def _listed(
+    assembly: Assembly,
+    skin: Float[np.ndarray, "body 3"],
+    used: Int[np.ndarray, " used"],
+    rows: Int[np.ndarray, " loose"],
+    spacing: float,
+    count: int,
+) -> Int[np.ndarray, "loose k"]:
+    """Skin vertices whose patches a hanging vertex compares."""
+    pool = used[spread_points(skin[used], spacing)]
+    k = min(count, len(pool))
+    return pool[KDTree(skin[pool]).query(assembly.rest[rows], k=k)[1].reshape(len(rows), k)]
 
 
 def _limb_labels(
@@ -106,82 +170,100 @@ def _limb_labels(
     return np.where(share.max(axis=1) > 0.5, share.argmax(axis=1) + 1, 0)
 
 
-def _patches(
-    assembly: Assembly,
-    skin: Float[np.ndarray, "body 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    label: Int[np.ndarray, " body"],
-    count: int,
-    spacing: float,
-    size: int,
-) -> tuple[Int[np.ndarray, "vertices k"], Int[np.ndarray, "centres patch"]]:
-    """Centres for each cloth vertex (as body vertices) and the triangles of each."""
-    tight = spread_points(skin, spacing)
-    wide = spread_points(skin, 1.6 * spacing)
-    cloth_label = _limb_labels(assembly.weights, assembly.body)
-    out = np.zeros((len(assembly.rest), count), dtype=np.int32)
-    for lab in range(5):
-        for loose in (False, True):
-            rows = np.flatnonzero((cloth_label == lab) & (assembly.loose == loose))
-            if len(rows) == 0:
-                continue
-            # Below the waist a skirt meets both legs; a trouser leg meets only its own.
-            pool = wide if loose else tight
-            if lab in (1, 2) and not loose:
-                pool = pool[label[pool] != 3 - lab]
-            k = min(count, len(pool))
-            near = KDTree(skin[pool]).query(assembly.rest[rows], k=k)[1].reshape(-1, k)
-            out[rows] = pool[near][:, np.minimum(np.arange(count), k - 1)]
-    middles = skin[faces].mean(axis=1)
-    size = min(size, len(faces))
-    table = np.zeros((len(skin), size), dtype=np.int32)
-    used = np.unique(out)
-    table[used] = KDTree(middles).query(skin[used], k=size)[1].reshape(-1, size)
-    return out, table
-
-
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Contact(Prepared):
     skin: Attached
-    candidates: Int[Array, "vertices k"]
-    table: Int[Array, "body patch"]
+    table: Int[Array, "skin patch"]
+    radius: Float[Array, " skin"]
     faces: Int[Array, "faces 3"]
+    tight: Int[Array, " tight"]
+    loose: Int[Array, " loose"]
+    start: Int[Array, " tight"]
+    listed: Int[Array, "loose k"]
     thickness: Float[Array, "vertices 1"]
     friction: Float[Array, "vertices 1"]
     free: Float[Array, "vertices 1"]
     push: float = dataclasses.field(metadata={"static": True})
-
-    def closest(
-        self, points: Float[Array, "vertices 3 batch"], skin: Float[Array, "body 3 batch"]
-    ) -> tuple[Int[Array, "vertices batch"], Float[Array, "3 vertices batch"]]:
-        """Closest face and barycentric weights of each vertex."""
-        lane = jnp.arange(points.shape[2])[None]
-        gap = skin[self.candidates] - points[:, None]
-        squared = jnp.sum(gap * gap, axis=2)
-        pick = jnp.argmin(squared, axis=1)
-        centre = jnp.take_along_axis(self.candidates, pick, axis=1)
-        patch = self.table[centre]
-        corners = [skin[self.faces[patch][..., k], :, lane[..., None]] for k in range(3)]
-        # [vertices, batch, patch, 3] with the component first for element-wise work.
-        corners = [jnp.moveaxis(c, -1, 0) for c in corners]
-        p = jnp.moveaxis(points, 1, 0)[..., None]
-        p = jnp.broadcast_to(p, corners[0].shape)
-        weights, distance = closest_barycentric(p, *corners)
-        best = jnp.argmin(distance, axis=2)
-        face = jnp.take_along_axis(patch, best[..., None], axis=2)[..., 0]
-        weights = jnp.take_along_axis(weights, best[None, ..., None], axis=3)[..., 0]
-        return jax.lax.stop_gradient(face), weights
+    leave: float = dataclasses.field(metadata={"static": True})
+    hops: int = dataclasses.field(metadata={"static": True})
 
     @property
     def attached(self) -> Attached:
         return self.skin
 
-    def begin(self, base: Array, start: Placed, end: Placed) -> tuple[Array, ...]:
-        face, weights = self.closest(base, start.points)
+    def initial(self, batch: int) -> Int[Array, "tight batch"]:
+        return jnp.repeat(self.start[:, None], batch, axis=1)
+
+    def keep(self, context: tuple[Array, ...]) -> Array:
+        return context[4]
+
+    def closest(
+        self,
+        points: Float[Array, "some 3 batch"],
+        skin: Float[Array, "skin 3 batch"],
+        centre: Int[Array, "some batch"],
+    ) -> tuple[Array, Array, Array, Array]:
+        """Closest point on the patch around a skin vertex.
+
+        Returns:
+            Face, barycentric weights [3, some, batch], the face's corner nearest to
+            the point, and the squared distance.
+        """
+        lane = jnp.arange(points.shape[2])[None]
+        patch = self.table[centre]
+        corners = [skin[self.faces[patch][..., k], :, lane[..., None]] for k in range(3)]
+        # [some, batch, patch] with the component first for element-wise work.
+        corners = [jnp.moveaxis(c, -1, 0) for c in corners]
+        p = jnp.broadcast_to(jnp.moveaxis(points, 1, 0)[..., None], corners[0].shape)
+        weights, squared = closest_barycentric(p, *corners)
+        best = jnp.argmin(squared, axis=2)
+        face = jnp.take_along_axis(patch, best[..., None], axis=2)[..., 0]
+        weights = jnp.take_along_axis(weights, best[None, ..., None], axis=3)[..., 0]
+        squared = jnp.take_along_axis(squared, best[..., None], axis=2)[..., 0]
+        corner = jnp.take_along_axis(
+            self.faces[face], jnp.argmax(weights, axis=0)[..., None], axis=2
+        )[..., 0]
+        stop = jax.lax.stop_gradient
+        return stop(face), weights, stop(corner), squared
+
+    def begin(
+        self, base: Array, start: Placed, end: Placed, clock: Clock, memory: Array
+    ) -> tuple[Array, ...]:
+        tight = base[self.tight]
+        centre = memory
+        for _ in range(self.hops):
+            last = centre
+            face, weights, centre, _ = self.closest(tight, start.points, last)
+        if self.loose.shape[0]:
+            loose = base[self.loose]
+            gap = start.points[self.listed] - loose[:, None]
+            pick = jnp.argmin(jnp.sum(gap * gap, axis=2), axis=1)
+            middle = jnp.take_along_axis(self.listed, pick, axis=1)
+            # The middle's own patch may be smaller than the list's mesh: walk on from there.
+            for _ in range(self.hops):
+                there = middle
+                more, other, middle, _ = self.closest(loose, start.points, there)
+            order = jnp.argsort(jnp.concatenate([self.tight, self.loose]))
+            face = jnp.concatenate([face, more])[order]
+            weights = jnp.concatenate([weights, other], axis=1)[:, order]
+            last = jnp.concatenate([last, there])[order]
         p0, n0 = _surface(start, self.faces, face, weights)
         p1, n1 = _surface(end, self.faces, face, weights)
-        return p0 - base, p1 - p0, n0, n1 - n0
+        lane = jnp.arange(base.shape[2])[None]
+        from_middle = p0 - jnp.moveaxis(start.points[last, :, lane], -1, 1)
+        far = jnp.sum(from_middle**2, axis=1) > self.radius[last] ** 2
+        unit = n0 / jnp.sqrt(jnp.sum(n0 * n0, axis=1, keepdims=True) + 1e-12)
+        height = jnp.sum((base - p0) * unit, axis=1, keepdims=True)
+        touching = height < self.thickness[..., None] + _NEAR
+        fastest = jnp.sum((p1 - p0) * unit, axis=1, keepdims=True) / clock.length + self.leave
+        ceiling = jnp.where(touching, fastest, jnp.inf)
+        return p0 - base, p1 - p0, n0, n1 - n0, centre, far, unit, ceiling
+
+    def accelerate(self, velocity: Array, context: tuple[Array, ...], h: float) -> Array:
+        unit, ceiling = context[6:]
+        outwards = jnp.sum(velocity * unit, axis=1, keepdims=True)
+        return velocity - jnp.maximum(outwards - ceiling, 0.0) * unit
 
     def project(
         self,
@@ -205,7 +287,7 @@ class _Contact(Prepared):
         self, displacement: Array, context: tuple[Array, ...], progress: Array
     ) -> tuple[Array, Array]:
         """Unit normals, and how much of the thickness is missing [m]."""
-        where, way, normal, turn = context
+        where, way, normal, turn = context[:4]
         n = normal + progress * turn
         n = n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-12)
         gap = displacement - (where + progress * way)
@@ -218,6 +300,8 @@ class _Contact(Prepared):
         return {
             "penetration_max": jnp.maximum(inside.max(axis=0), 0.0),
             "inside_share": jnp.mean((inside > 0).astype(displacement.dtype), axis=0),
+            # Far from the skin it doesn't matter which point is the closest.
+            "missed": jnp.sum(context[5] & (inside > -0.02), axis=0),
         }
 
 

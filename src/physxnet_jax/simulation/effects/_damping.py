@@ -32,5 +32,5 @@ class Damping(Effect):
 class _Damping(Prepared):
     rate: float = dataclasses.field(metadata={"static": True})
 
-    def accelerate(self, velocity: Array, h: float) -> Array:
+    def accelerate(self, velocity: Array, context: None, h: float) -> Array:
         return velocity * math.exp(-self.rate * h)

@@ -29,5 +29,5 @@ class Gravity(Effect):
 class _Gravity(Prepared):
     g: float = dataclasses.field(metadata={"static": True})
 
-    def accelerate(self, velocity: Array, h: float) -> Array:
+    def accelerate(self, velocity: Array, context: None, h: float) -> Array:
         return velocity.at[:, 1].add(-self.g * h)

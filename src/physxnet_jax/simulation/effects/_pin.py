@@ -1,6 +1,7 @@
 """Pins: vertices that move with the skin beneath them."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Array, Int
 
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Attached, Effect, Placed, Prepared
+from .._effect import Attached, Clock, Effect, Placed, Prepared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Pin(Effect):
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Pin(Prepared):
+    holds = True
     index: Int[Array, " pins"]
     skin: Attached
 
@@ -36,7 +38,9 @@ class _Pin(Prepared):
     def attached(self) -> Attached:
         return self.skin
 
-    def begin(self, base: Array, start: Placed, end: Placed) -> tuple[Array, Array]:
+    def begin(
+        self, base: Array, start: Placed, end: Placed, clock: Clock, memory: Any
+    ) -> tuple[Array, Array]:
         return start.points - base[self.index], end.points - start.points
 
     def project(

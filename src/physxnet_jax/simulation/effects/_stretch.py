@@ -1,6 +1,7 @@
 """Stretch: edges resist a change of length, less so when compressed."""
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from ...geometry import greedy_colours, mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Effect, Prepared
+from .._effect import Clock, Effect, Prepared
 from ._coloured import scatter_rows
 
 
@@ -76,10 +77,13 @@ class _Group:
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Stretch(Prepared):
+    elastic = True
     groups: tuple[_Group, ...]
     softer: float = dataclasses.field(metadata={"static": True})
 
-    def begin(self, base: Array, start: None, end: None) -> tuple[Array, ...]:
+    def begin(
+        self, base: Array, start: None, end: None, clock: Clock, memory: Any
+    ) -> tuple[Array, ...]:
         return tuple(base[g.b] - base[g.a] for g in self.groups)
 
     def project(
@@ -101,6 +105,38 @@ class _Stretch(Prepared):
             move = span * (excess / (length * (g.weight_a + g.weight_b + alpha)))
             d = scatter_rows(d, [g.a, g.b], [da + g.weight_a * move, db - g.weight_b * move])
         return d
+
+    def energy(self, displacement: Array, context: tuple[Array, ...]) -> Array:
+        total = jnp.zeros(displacement.shape[2:], displacement.dtype)
+        for g, edge in zip(self.groups, context, strict=True):
+            span = edge + (displacement[g.b] - displacement[g.a])
+            excess = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18) - g.length
+            alpha = g.compliance * jnp.where(excess < 0, self.softer, 1.0)
+            total = total + 0.5 * jnp.sum(excess**2 / alpha, axis=(0, 1))
+        return total
+
+    def coupled(self) -> Int[np.ndarray, "blocks 2"]:
+        out = []
+        for g in self.groups:
+            a, b = np.asarray(g.a), np.asarray(g.b)
+            out += [np.column_stack(p) for p in ((a, a), (b, b), (a, b), (b, a))]
+        return np.concatenate(out)
+
+    def hessian(self, displacement: Array, context: tuple[Array, ...]) -> Array:
+        """Along the edge always, across it only in tension: so it stays positive."""
+        out = []
+        eye = jnp.eye(3, dtype=displacement.dtype)[None, None]
+        for g, edge in zip(self.groups, context, strict=True):
+            span = jnp.swapaxes(edge + (displacement[g.b] - displacement[g.a]), 1, 2)
+            length = jnp.sqrt(jnp.sum(span * span, axis=2, keepdims=True) + 1e-18)[..., None]
+            rest = g.length[..., None]
+            k = 1.0 / (g.compliance[..., None] * jnp.where(length < rest, self.softer, 1.0))
+            n = span / length[..., 0]
+            along = n[..., :, None] * n[..., None, :]
+            taut = jnp.maximum(1.0 - rest / length, 0.0)
+            block = k * (along + taut * (eye - along))
+            out += [block, block, -block, -block]
+        return jnp.concatenate(out)
 
     def diagnose(self, displacement: Array, context: tuple[Array, ...]) -> dict[str, Array]:
         strain = []

@@ -1,0 +1,104 @@
+"""What a rollout tells about itself."""
+
+import dataclasses
+import enum
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..errors import SimulationError
+
+
+class Status(enum.IntFlag):
+    """What was found wrong in a frame; 0 is a frame without complaint."""
+
+    NONFINITE = 1
+    """A NaN or an infinity."""
+    UNCONVERGED = 2
+    """Residual of a per cent of the vertices above 1."""
+    STRAINED = 4
+    """An edge longer than 1.5 times its rest length."""
+    INSIDE = 8
+    """A vertex more than 1 cm inside the body."""
+    MISSED = 16
+    """Contact may have missed the closest skin, see `BodyContact`."""
+    PINCHED = 32
+    """Cloth between two limbs that leave it no room."""
+    FAST = 64
+    """A vertex faster than 50 m/s."""
+    OVERFLOW = 128
+    """A list of self-contacts was too short."""
+
+
+_STRAIN, _INSIDE, _SPEED = 0.5, 0.01, 50.0
+_CAUSES = {
+    Status.FAST: "a teleport in the motion",
+    Status.STRAINED: "a garment too tight or degenerate triangles in it",
+    Status.INSIDE: "cloth trapped in the body",
+    Status.UNCONVERGED: "too few substeps",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Rollout:
+    """What a rollout gives.
+
+    Attributes:
+        positions: Cloth positions of every garment [m], shapes [frames, vertices, 3].
+        fps: Frames a second.
+        diagnostics: Values of each frame: ``finite``, ``speed_max`` [m/s],
+            ``worst_vertex`` (the fastest), ``residual_max`` and ``residual_p99``
+            (1 is the tolerance of 0.5 mm), and what the scene's effects add:
+            ``strain_max``, ``strain_p99`` [1], ``penetration_max`` [m],
+            ``inside_share``, ``missed``, ``pinched``; ``energy_...`` [J] if asked for.
+        name: Of the motion.
+    """
+
+    positions: tuple[Float[np.ndarray, "frames vertices 3"], ...]
+    fps: float
+    diagnostics: dict[str, np.ndarray]
+    name: str = ""
+
+    @property
+    def finite(self) -> Bool[np.ndarray, " frames"]:
+        """Which frames hold no NaN and no infinity."""
+        return self.diagnostics["finite"].astype(bool)
+
+    @property
+    def status(self) -> Int[np.ndarray, " frames"]:
+        """`Status` bits of each frame."""
+        d = self.diagnostics
+        nothing = np.zeros(len(self.finite))
+
+        def bit(flag: Status, wrong: np.ndarray) -> np.ndarray:
+            return np.where(wrong, int(flag), 0)
+
+        return (
+            bit(Status.NONFINITE, ~self.finite)
+            | bit(Status.UNCONVERGED, ~(d["residual_p99"] <= 1.0))
+            | bit(Status.STRAINED, ~(d.get("strain_max", nothing) <= _STRAIN))
+            | bit(Status.INSIDE, ~(d.get("penetration_max", nothing) <= _INSIDE))
+            | bit(Status.MISSED, d.get("missed", nothing) > 0)
+            | bit(Status.PINCHED, d.get("pinched", nothing) > 0)
+            | bit(Status.FAST, ~(d["speed_max"] <= _SPEED))
+            | bit(Status.OVERFLOW, d.get("overflow", nothing) > 0)
+        )
+
+    def check(self) -> None:
+        """Raises if a frame isn't finite.
+
+        Raises:
+            SimulationError: Frame, vertex and the likely cause: what the frames before
+                complained of.
+        """
+        if self.finite.all():
+            return
+        frame = int(np.argmin(self.finite))
+        vertex = int(self.diagnostics["worst_vertex"][frame])
+        before = int(np.bitwise_or.reduce(self.status[max(frame - 5, 0) : frame], initial=0))
+        likely = [text for flag, text in _CAUSES.items() if before & flag]
+        raise SimulationError(
+            f"{self.name or 'motion'}: frame {frame}, vertex {vertex} is not finite; likely"
+            f" {' or '.join(likely[:2] or ['a value in the input that is not finite'])}."
+            " Try accuracy='fine'; see Rollout.status of the frames before."
+        )

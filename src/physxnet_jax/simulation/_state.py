@@ -1,0 +1,69 @@
+"""What moves, and what it is moved by."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..body import Body, blend_rotations
+from ..typing import pytree
+from ._effect import Attached, Placed, Prepared
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class State:
+    """Cloth in motion.
+
+    Attributes:
+        position: Positions [m], shape [vertices, 3, batch].
+        velocity: Velocities [m/s], shape [vertices, 3, batch].
+        memory: What the solver remembers of earlier steps, see `Solver.remember`.
+        kept: What each effect remembers; None at the start, see `Prepared.initial`.
+    """
+
+    position: Float[Array, "vertices 3 batch"]
+    velocity: Float[Array, "vertices 3 batch"]
+    memory: Any = ()
+    kept: Any = None
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class System:
+    """A scene on the device.
+
+    Attributes:
+        body: The body.
+        rest: Its rest vertices [m], shape [all, 3].
+        effects: Prepared effects, in the order in which they act.
+        inverse_mass: [1/kg], 0 where held, shape [vertices, 1, 1].
+        extra: What the solver prepared, see `Solver.prepare`.
+    """
+
+    body: Body
+    rest: Float[Array, "all 3"]
+    effects: tuple[Prepared, ...]
+    inverse_mass: Float[Array, "vertices 1 1"]
+    extra: Any = None
+
+
+def place(
+    body: Body,
+    rest: Float[Array, "all 3"],
+    attached: Attached,
+    rotations: Float[Array, "batch joints 4"],
+    root: Float[Array, "batch 3"],
+) -> Placed:
+    """Attached points skinned with the body in a batch of poses."""
+
+    def one(q: Array, p: Array) -> tuple[Array, Array]:
+        world, shift = body.transforms(rest, q, p)
+        blend = blend_rotations(attached.weights, world)
+        points = jnp.einsum("vab,vb->va", blend, attached.rest) + attached.weights @ shift
+        return points, jnp.einsum("vab,vb->va", blend, attached.normals)
+
+    points, normals = jax.vmap(one, out_axes=2)(rotations, root)
+    return Placed(points, normals)

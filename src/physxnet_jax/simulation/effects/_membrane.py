@@ -1,0 +1,126 @@
+"""Membrane: triangles resist stretch along warp and weft, and shear between them."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ...typing import pytree
+from .._assembly import Assembly
+from .._effect import Effect, Prepared
+from ._coloured import Coloured, Constraint, Group, colour_groups
+
+
+@dataclasses.dataclass(frozen=True)
+class Membrane(Effect):
+    """``E = 1/2 sum A (Y_u (|w_u|-1)^2 + Y_v (|w_v|-1)^2 + G s^2)`` over triangles.
+
+    ``w_u`` and ``w_v`` are the images of the warp and weft directions, ``s`` their
+    inner product over their lengths, the sine of the shear angle. Unlike springs along
+    edges (`Stretch`), the three stiffnesses don't depend on how the mesh is cut.
+
+    Attributes:
+        compression: Stiffness against shortening as a share of that against
+            lengthening.
+
+    References:
+        Baraff and Witkin, Large steps in cloth simulation (1998), section 4.2 (shear
+        here by angle); Macklin et al., XPBD (2016).
+    """
+
+    compression: float = 0.2
+
+    def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
+        """Colours the triangles; those without area are left out."""
+        faces, area, inverse = rest_frames(assembly)
+        usable = area > 1e-10
+        a = area[usable]
+        fabric = assembly.membrane[usable]
+        law = {
+            "u1": inverse[usable, 0, 0],
+            "u2": inverse[usable, 1, 0],
+            "v1": inverse[usable, 0, 1],
+            "v2": inverse[usable, 1, 1],
+            "warp": 1.0 / np.maximum(a * fabric[:, 0], 1e-9),
+            "weft": 1.0 / np.maximum(a * fabric[:, 1], 1e-9),
+            "shear": 1.0 / np.maximum(a * fabric[:, 2], 1e-9),
+        }
+        groups = colour_groups(faces[usable], np.asarray(inverse_mass), law)
+        return _Membrane(groups, 1.0 / self.compression)
+
+
+def rest_frames(
+    assembly: Assembly,
+) -> tuple[Int[np.ndarray, "faces 3"], Float[np.ndarray, " faces"], Float[np.ndarray, "faces 2 2"]]:
+    """Faces, their areas [m^2] and the inverse of their edges in warp and weft [1/m].
+
+    The warp runs down the garment: the projection of the vertical at rest, or of the
+    depth where a triangle lies level.
+    """
+    x, f = assembly.rest, assembly.faces
+    e1, e2 = x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]]
+    normal = np.cross(e1, e2)
+    twice = np.linalg.norm(normal, axis=1)
+    n = normal / np.maximum(twice, 1e-12)[:, None]
+    warp = -n * n[:, 1:2]
+    warp[:, 1] += 1.0
+    level = np.linalg.norm(warp, axis=1) < 0.2
+    depth = -n * n[:, 2:3]
+    depth[:, 2] += 1.0
+    warp[level] = depth[level]
+    warp /= np.maximum(np.linalg.norm(warp, axis=1), 1e-12)[:, None]
+    weft = np.cross(n, warp)
+    edges = np.stack(
+        [
+            np.stack([np.sum(e1 * warp, axis=1), np.sum(e2 * warp, axis=1)], axis=1),
+            np.stack([np.sum(e1 * weft, axis=1), np.sum(e2 * weft, axis=1)], axis=1),
+        ],
+        axis=1,
+    )
+    safe = np.where((twice > 1e-10)[:, None, None], edges, np.eye(2))
+    return f, 0.5 * twice, np.linalg.inv(safe)
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class _Membrane(Coloured):
+    groups: tuple[Group, ...]
+    softer: float = dataclasses.field(metadata={"static": True})
+
+    def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
+        def direction(one: str, two: str, compliance: str) -> Any:
+            def c(x: tuple[Array, ...]) -> Constraint:
+                p, q = law[one], law[two]
+                w = p * x[1] + q * x[2]
+                length = jnp.sqrt(jnp.sum(w * w, axis=1, keepdims=True) + 1e-18)
+                n = w / length
+                alpha = law[compliance] * jnp.where(length < 1.0, self.softer, 1.0)
+                return Constraint(length - 1.0, (-(p + q) * n, p * n, q * n), alpha)
+
+            return c
+
+        def shear(x: tuple[Array, ...]) -> Constraint:
+            u1, u2, v1, v2 = law["u1"], law["u2"], law["v1"], law["v2"]
+            u, v = u1 * x[1] + u2 * x[2], v1 * x[1] + v2 * x[2]
+            # A collapsed direction has no angle: below a tenth it counts as a tenth.
+            lu = jnp.sqrt(jnp.maximum(jnp.sum(u * u, axis=1, keepdims=True), 1e-2))
+            lv = jnp.sqrt(jnp.maximum(jnp.sum(v * v, axis=1, keepdims=True), 1e-2))
+            u, v = u / lu, v / lv
+            sine = jnp.sum(u * v, axis=1, keepdims=True)
+            by_u, by_v = (v - sine * u) / lu, (u - sine * v) / lv
+            one, two = u1 * by_u + v1 * by_v, u2 * by_u + v2 * by_v
+            return Constraint(sine, (-(one + two), one, two), law["shear"])
+
+        return [direction("u1", "u2", "warp"), direction("v1", "v2", "weft"), shear]
+
+    def diagnose(self, displacement: Array, context: tuple) -> dict[str, Array]:
+        strain = []
+        for g, edges in zip(self.groups, context, strict=True):
+            x = self._corners([displacement[i] for i in g.index], edges)
+            for one, two in (("u1", "u2"), ("v1", "v2")):
+                w = g.law[one] * x[1] + g.law[two] * x[2]
+                strain.append(jnp.sqrt(jnp.sum(w * w, axis=1)) - 1.0)
+        every = jnp.concatenate(strain)
+        return {"strain_max": every.max(axis=0), "strain_p99": jnp.quantile(every, 0.99, axis=0)}

@@ -1,0 +1,57 @@
+"""Strain limiting: edges never longer than so much more than at rest."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ...geometry import mesh_edges
+from ...typing import pytree
+from .._assembly import Assembly
+from .._effect import Effect, Prepared
+from ._coloured import Coloured, Constraint, Group, colour_groups
+
+
+@dataclasses.dataclass(frozen=True)
+class StrainLimit(Effect):
+    """Woven cloth stiffens sharply once its threads are straight: a hard bound.
+
+    One sweep a substep; it stores no energy.
+
+    Attributes:
+        limit: Greatest elongation as a share of the rest length.
+
+    References:
+        Provot, Deformation constraints in a mass-spring model (1995).
+    """
+
+    limit: float = 0.1
+
+    def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
+        """Colours the edges."""
+        x = assembly.rest
+        ends = mesh_edges(assembly.faces).vertices
+        length = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1)
+        law = {"longest": (1 + self.limit) * np.maximum(length, 1e-4)}
+        return _StrainLimit(colour_groups(ends, np.asarray(inverse_mass), law))
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class _StrainLimit(Coloured):
+    elastic = False
+    groups: tuple[Group, ...]
+
+    def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
+        def excess(x: tuple[Array, ...]) -> Constraint:
+            length = jnp.sqrt(jnp.sum(x[1] * x[1], axis=1, keepdims=True) + 1e-18)
+            n = x[1] / length
+            over = jnp.maximum(length - law["longest"], 0.0)
+            return Constraint(over, (-n, n), jnp.zeros_like(law["longest"]))
+
+        return [excess]
+
+    def energy(self, displacement: Array, context: tuple) -> None:
+        return None

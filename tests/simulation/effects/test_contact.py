@@ -1,0 +1,120 @@
+"""Contact: the closest skin is found, cloth slides, nothing tunnels or is shot away."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.body import NUM_BODY_VERTICES
+from physxnet_jax.garment import template
+from physxnet_jax.geometry import closest_points
+from physxnet_jax.motion import Motion, animate, load_motion
+from physxnet_jax.simulation import (
+    STANDARD,
+    XPBD,
+    BodyContact,
+    Clock,
+    Pin,
+    Scene,
+    prepare_scene,
+    simulate,
+    simulate_still,
+)
+
+FPS = 30.0
+CLOCK = Clock(jnp.float32(0.0), 1 / 120)
+
+
+def skin_at(body, rest, motion, frame):
+    part = Motion(motion.rotations[frame : frame + 1], motion.root[frame : frame + 1], FPS)
+    every = jnp.arange(NUM_BODY_VERTICES)
+    return animate(body, rest, rest[every], body.weights[every], part)[0]
+
+
+@pytest.mark.parametrize("name", ["top", "bottom", "dress"])
+def test_the_foot_is_the_closest_point_of_the_whole_body(body, rest, name):
+    """Against brute force in the rest pose; misses are counted, and shallow."""
+    scene = prepare_scene(Scene((template(name),), (BodyContact(),)))
+    contact = scene.effects[0]
+    x = jnp.asarray(scene.assembly.rest.astype(np.float32))
+    skin = contact.attached
+    placed = dataclasses.replace(
+        _placed(skin), points=skin.rest[:, :, None], normals=skin.normals[:, :, None]
+    )
+    context = contact.begin(x[:, :, None], placed, placed, CLOCK, contact.initial(1))
+    mine = np.linalg.norm(np.asarray(context[0])[..., 0], axis=1)
+    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
+    exact = np.sqrt(np.asarray(closest_points(mesh, x).squared_distance))
+    assert (mine > exact - 1e-5).all(), "nothing is closer than the closest"
+    missed = mine > exact + 1e-4
+    # Sleeves keep to the arm where the trunk is a little nearer.
+    assert missed.mean() < 0.02, missed.mean()
+
+
+def _placed(attached):
+    from physxnet_jax.simulation._effect import Placed
+
+    return Placed(attached.rest[:, :, None], attached.normals[:, :, None])
+
+
+def fast(motion, factor):
+    """The same poses in a fraction of the time: every so-manieth frame."""
+    return dataclasses.replace(
+        motion, rotations=motion.rotations[::factor], root=motion.root[::factor]
+    )
+
+
+def test_nothing_tunnels_through_a_punch_at_eight_times_its_speed():
+    motion = fast(load_motion("punch", fps=FPS), 8)
+    out = simulate(Scene((template("top"),)), motion)
+    assert out.diagnostics["penetration_max"].max() < 2e-3
+    assert out.diagnostics["inside_share"].max() < 1e-3
+    # The control: without contact the sleeve stays behind.
+    none = tuple(e for e in STANDARD if not isinstance(e, BodyContact))
+    free = simulate(Scene((template("top"),), none), motion)
+    assert "penetration_max" not in free.diagnostics
+    assert np.abs(free.positions[0] - out.positions[0]).max() > 0.05
+
+
+def test_cloth_that_starts_inside_comes_out_gently(body, rest):
+    """10 mm inside: out within a frame, no faster than the cap allows."""
+    g = template("bottom")
+    scene = prepare_scene(Scene((g,), (BodyContact(), Pin())))
+    x = scene.assembly.rest
+    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
+    hit = closest_points(mesh, jnp.asarray(x, jnp.float32))
+    tri = np.asarray(mesh.faces)[np.asarray(hit.face)]
+    foot = np.einsum("vk,vkc->vc", np.asarray(hit.weights), np.asarray(mesh.vertices)[tri])
+    away = (x - foot) / np.linalg.norm(x - foot, axis=1, keepdims=True)
+    sunk = foot - 0.010 * away
+    out = simulate_still(scene, 5, solver=XPBD(32, 4), start=sunk)
+    d = out.diagnostics
+    assert d["penetration_max"][0] < 1e-3
+    # Set down, not shot away: at the cap, a metre a second, at most a few cm travelled.
+    assert d["speed_max"][1:].max() < 1.5
+    reckless = prepare_scene(Scene((g,), (BodyContact(leave=1e6), Pin())))
+    wild = simulate_still(reckless, 5, solver=XPBD(32, 4), start=sunk)
+    assert wild.diagnostics["speed_max"][0] > 3.0
+
+
+def test_cloth_follows_its_own_skin_across_a_sharp_fold(body, rest):
+    """A knee bent by 150 degrees: thigh and calf pass through each other, each keeps
+    its own cloth, and the cloth comes back when the leg is stretched again."""
+    frames = 24
+    angle = np.radians(150) * np.sin(np.pi * np.arange(frames) / (frames - 1))
+    pose = np.repeat(np.asarray(body.a_pose())[None], frames, axis=0)
+    joint = body.joint("LeftLeg")
+    pose[:, joint] = np.column_stack([np.cos(angle / 2), np.sin(angle / 2), 0 * angle, 0 * angle])
+    heads = body.joint_positions(rest)[0]
+    root = np.repeat(np.asarray(heads)[:1], frames, axis=0)
+    motion = Motion(jnp.asarray(pose, jnp.float32), jnp.asarray(root), FPS, "knee")
+    out = simulate(Scene((template("bottom"),)), motion)
+    assert out.diagnostics["inside_share"].max() < 1e-3
+    assert out.diagnostics["strain_p99"].max() < 0.5
+    calm = simulate(
+        Scene((template("bottom"),)),
+        dataclasses.replace(motion, rotations=motion.rotations[:1], root=motion.root[:1]),
+    )
+    gap = np.linalg.norm(out.positions[0][-1] - calm.positions[0][0], axis=1)
+    assert np.median(gap) < 0.01

@@ -1,0 +1,211 @@
+"""Laws of the elastic effects: closed forms, invariances, derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.garment import Fabric, free_garment, square_sheet
+from physxnet_jax.simulation import (
+    XPBD,
+    Bend,
+    Clock,
+    Dihedral,
+    Gravity,
+    Membrane,
+    Pin,
+    Scene,
+    StrainLimit,
+    Stretch,
+    prepare_scene,
+    simulate_still,
+)
+from physxnet_jax.simulation.effects._coloured import Coloured
+
+FABRIC = Fabric(stretch=300.0, bend=1e-4, warp=400.0, weft=200.0, shear=30.0)
+CLOCK = Clock(jnp.float32(0.0), 0.01)
+ELASTIC = [Stretch(), Membrane(), Bend(), Dihedral()]
+
+
+def prepared(effect, garment):
+    scene = prepare_scene(Scene((garment,), (effect,)))
+    return scene.effects[0], scene.assembly.rest
+
+
+def energy(effect, rest, x):
+    """Energy at positions x, with the rest shape as the block's base."""
+    base = jnp.asarray(rest, jnp.float32)[:, :, None]
+    context = effect.begin(base, None, None, CLOCK, ())
+    return effect.energy(jnp.asarray(x, jnp.float32)[:, :, None] - base, context)[0]
+
+
+def turned(x, seed):
+    q = np.random.default_rng(seed).normal(size=(3, 3))
+    r = np.linalg.qr(q)[0]
+    r *= np.sign(np.linalg.det(r))
+    return (x - x.mean(0)) @ r.T + [0.3, -0.2, 1.0]
+
+
+@pytest.mark.parametrize("effect", ELASTIC)
+@pytest.mark.parametrize("seed", [0, 1])
+def test_rigid_motion_stores_no_energy_and_changes_none(effect, seed):
+    e, rest = prepared(effect, square_sheet(5, 0.2, fabric=FABRIC))
+    bent = rest + np.random.default_rng(seed).normal(size=rest.shape) * 0.004
+    reference = float(energy(e, rest, bent))
+    assert reference > 1e-6
+    assert float(energy(e, rest, turned(rest, seed))) < 1e-5 * reference + 1e-9
+    assert float(energy(e, rest, turned(bent, seed))) == pytest.approx(reference, rel=2e-3)
+
+
+@pytest.mark.parametrize("direction", [0, 2])
+@pytest.mark.parametrize("strain", [0.1, -0.1])
+def test_membrane_patch_test(direction, strain):
+    """Uniform stretch along warp (z, level sheet) and weft (x): E = 1/2 Y A strain^2."""
+    e, rest = prepared(Membrane(compression=0.5), square_sheet(4, 0.2, fabric=FABRIC))
+    x = rest.copy()
+    x[:, direction] = rest[0, direction] + (1 + strain) * (rest[:, direction] - rest[0, direction])
+    stiffness = {2: 400.0, 0: 200.0}[direction] * (0.5 if strain < 0 else 1.0)
+    expected = 0.5 * stiffness * 0.2**2 * strain**2
+    assert float(energy(e, rest, x)) == pytest.approx(expected, rel=1e-4)
+
+
+def test_membrane_shear_is_the_angle_between_the_threads():
+    e, rest = prepared(Membrane(), square_sheet(4, 0.2, fabric=FABRIC))
+    angle = 0.1
+    x = rest.copy()
+    # Threads along x turn by the angle and keep their length: no stretch, only shear.
+    along = rest[:, 0] - rest[0, 0]
+    x[:, 0] = rest[0, 0] + along * np.cos(angle)
+    x[:, 2] = rest[:, 2] + along * np.sin(angle)
+    expected = 0.5 * 30.0 * 0.2**2 * np.sin(angle) ** 2
+    assert float(energy(e, rest, x)) == pytest.approx(expected, rel=1e-3)
+
+
+def test_springs_are_as_stiff_as_the_sheet_they_stand_for():
+    """A regular spring mesh is an isotropic sheet of Poisson's ratio 1/3: stretched
+    both ways it stores Y A strain^2 / (1 - 1/3)."""
+    e, rest = prepared(Stretch(compression=1.0), square_sheet(21, 0.4, fabric=FABRIC))
+    x = rest.copy()
+    x[:, 0] *= 1.01
+    x[:, 2] = rest[0, 2] + 1.01 * (rest[:, 2] - rest[0, 2])
+    expected = 300.0 * 0.4**2 * 0.01**2 / (1 - 1 / 3)
+    assert float(energy(e, rest, x)) == pytest.approx(expected, rel=1e-3)
+
+
+def rolled(rest, angle, radius):
+    """A level sheet rolled to a cylinder whose axis lies at an angle to the weft."""
+    c, s = np.cos(angle), np.sin(angle)
+    p = rest - rest.mean(0)
+    u, v = c * p[:, 0] + s * p[:, 2], -s * p[:, 0] + c * p[:, 2]
+    u, y = radius * np.sin(u / radius), radius * (1 - np.cos(u / radius))
+    return np.column_stack([c * u - s * v, y, s * u + c * v])
+
+
+@pytest.mark.parametrize("n", [17, 33])
+@pytest.mark.parametrize("angle", [0.0, 0.4, np.pi / 4])
+def test_a_cylinder_stores_half_k_kappa_squared_an_area(n, angle):
+    size, radius = 0.2, 0.15
+    e, rest = prepared(Bend(), square_sheet(n, size, fabric=FABRIC))
+    # Boundary vertices have no stencil: their share of the area stores nothing.
+    area = (size * (n - 2) / (n - 1)) ** 2
+    expected = 0.5 * 1e-4 / radius**2 * area
+    assert float(energy(e, rest, rolled(rest, angle, radius))) == pytest.approx(expected, rel=0.02)
+
+
+def test_hinges_are_right_on_average_over_directions_and_only_then():
+    size, radius = 0.2, 0.15
+    e, rest = prepared(Dihedral(), square_sheet(33, size, fabric=FABRIC))
+    angles = np.arange(8) * np.pi / 8
+    stored = [float(energy(e, rest, rolled(rest, a, radius))) for a in angles]
+    expected = 0.5 * 1e-4 / radius**2 * size**2
+    assert np.mean(stored) == pytest.approx(expected, rel=0.06)
+    assert max(stored) / min(stored) > 1.1
+
+
+@pytest.mark.parametrize("effect", [Membrane(), Dihedral(), StrainLimit()])
+def test_gradients_of_constraints_are_those_of_their_values(effect):
+    e, rest = prepared(effect, square_sheet(4, 0.1, fabric=FABRIC))
+    assert isinstance(e, Coloured)
+    x = rest + np.random.default_rng(3).normal(size=rest.shape) * 0.02
+    base = jnp.asarray(rest, jnp.float32)[:, :, None]
+    context = e.begin(base, None, None, CLOCK, ())
+    d = jnp.asarray(x, jnp.float32)[:, :, None] - base
+    for g, edges in zip(e.groups, context, strict=True):
+        corners = e._corners([d[i] for i in g.index], edges)
+        for law in e.measure(g.law, corners):
+            c = law(corners)
+
+            def value(y, law=law):
+                return law(tuple(q - y[0] for q in y)).value.sum()
+
+            slope = jax.grad(value)(corners)
+            scale = max(float(jnp.abs(s).max()) for s in slope) + 1e-6
+            for mine, theirs in zip(c.gradients, slope, strict=True):
+                # A limit that isn't reached has no slope, and moves nothing.
+                gap = np.where(np.asarray(c.value) != 0, np.asarray(mine - theirs), 0.0)
+                gap = np.abs(gap).max()
+                assert gap < 2e-3 * scale
+
+
+@pytest.mark.parametrize("effect", ELASTIC)
+def test_hessians_are_symmetric_positive_and_near_the_energys(effect):
+    e, rest = prepared(effect, square_sheet(3, 0.1, fabric=FABRIC))
+    count = len(rest)
+    # In tension: what the blocks leave out there is small.
+    x = rest.mean(0) + (rest - rest.mean(0)) * 1.02
+    x[:, 1] += 1e-4 * np.random.default_rng(0).normal(size=count)
+    base = jnp.asarray(rest, jnp.float32)[:, :, None]
+    context = e.begin(base, None, None, CLOCK, ())
+    d = jnp.asarray(x, jnp.float32)[:, :, None] - base
+    pairs = np.asarray(e.coupled())
+    full = np.zeros((count, 3, count, 3))
+    values = e.hessian(d, context)
+    if values is not None:
+        for (a, b), v in zip(pairs, np.asarray(values)[:, 0], strict=True):
+            full[a, :, b] += v
+    constant = e.constant_stiffness()
+    if constant is not None:
+        for (a, b), v in zip(pairs, constant, strict=True):
+            full[a, :, b] += v * np.eye(3)
+    full = full.reshape(3 * count, 3 * count)
+    np.testing.assert_allclose(full, full.T, atol=1e-4 * np.abs(full).max())
+    assert np.linalg.eigvalsh(full).min() > -1e-5 * np.abs(full).max()
+    exact = jax.hessian(lambda y: e.energy(y, context)[0])(d)
+    exact = np.asarray(exact)[:, :, 0, :, :, 0].reshape(3 * count, 3 * count)
+    assert np.abs(full - exact).max() < 0.1 * np.abs(exact).max()
+
+
+def test_a_strain_limit_holds_what_springs_alone_do_not():
+    weak = Fabric(stretch=1.0, bend=1e-6)
+    g = square_sheet(6, 0.3, upright=True, pinned=np.arange(6), fabric=weak)
+
+    def worst(*limit):
+        scene = prepare_scene(Scene((g,), (Gravity(), Stretch(), Bend(), *limit, Pin())))
+        out = simulate_still(scene, 30, solver=XPBD(32, 2))
+        rest = np.asarray(g.mesh.vertices)
+        x = out.positions[0][-1]
+        return max(
+            np.linalg.norm(x[6 * (k + 1) + j] - x[6 * k + j])
+            / np.linalg.norm(rest[6 * (k + 1) + j] - rest[6 * k + j])
+            for k in range(5)
+            for j in range(6)
+        )
+
+    assert worst() > 1.25
+    assert worst(StrainLimit(0.05)) < 1.08
+
+
+def test_slivers_and_collapsed_triangles_keep_value_and_gradient_finite():
+    v = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 1e-9, 0], [0, 0, 0.1], [0, 0, 0.1]], float)
+    g = free_garment(v, np.array([[0, 1, 2], [0, 1, 3], [0, 3, 4]]))
+    for effect in (*ELASTIC, StrainLimit()):
+        e, rest = prepared(effect, g)
+        base = jnp.asarray(rest, jnp.float32)[:, :, None]
+        for x in (rest, np.zeros_like(rest), rest * [1, 1, 0]):
+            context = e.begin(base, None, None, CLOCK, ())
+            d = jnp.asarray(x, jnp.float32)[:, :, None] - base
+            moved = e.project(d, d, context, jnp.float32(1.0), (0.001, 0.1))
+            assert np.isfinite(np.asarray(moved)).all(), (effect, x)
+            if e.elastic:
+                value, slope = jax.value_and_grad(lambda y, e=e, c=context: e.energy(y, c).sum())(d)
+                assert np.isfinite(float(value)) and np.isfinite(np.asarray(slope)).all()

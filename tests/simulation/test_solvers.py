@@ -1,0 +1,169 @@
+"""Solvers against the float64 reference: order, agreement, gradients, breakdown."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.errors import SimulationError
+from physxnet_jax.garment import Fabric, square_sheet
+from physxnet_jax.motion import load_motion
+from physxnet_jax.simulation import (
+    ACCURACY,
+    XPBD,
+    Bend,
+    Dihedral,
+    Gravity,
+    Implicit,
+    Membrane,
+    Pin,
+    Scene,
+    State,
+    Status,
+    Stretch,
+    Verlet,
+    advance,
+    prepare_scene,
+    simulate,
+    simulate_still,
+)
+
+SOFT = Fabric(stretch=300.0, bend=1e-4, warp=300.0, weft=300.0, shear=50.0)
+
+
+SPRINGS = (Stretch(compression=1.0), Bend())
+
+
+def swinging(effects=SPRINGS):
+    g = square_sheet(6, 0.3, pinned=np.arange(6), fabric=SOFT)
+    return prepare_scene(Scene((g,), (Gravity(), *effects, Pin())))
+
+
+def rms(a, b):
+    return float(np.sqrt(((a - b) ** 2).sum(axis=-1).mean()))
+
+
+def last(scene, solver, frames=5):
+    return simulate_still(scene, frames, solver=solver).positions[0][-1].astype(np.float64)
+
+
+@pytest.fixture(scope="module")
+def reference():
+    scene = swinging()
+    fine, coarse = (last(scene, Verlet(substeps=n, queries=1)) for n in (1024, 512))
+    assert rms(fine, coarse) < 1e-7, "the reference agrees with itself"
+    return scene, fine
+
+
+@pytest.mark.parametrize(
+    ("make", "order", "within", "substeps"),
+    [
+        (lambda n: XPBD(n, 8), 1.0, 0.15, (32, 64, 128)),
+        (lambda n: Implicit(n, 1, newton=3, order=1), 1.0, 0.15, (16, 32, 64)),
+        (
+            lambda n: Implicit(n, 1, "float64", order=2, newton=3, tolerance=1e-8),
+            2.0,
+            0.2,
+            (16, 32, 64),
+        ),
+    ],
+    ids=["xpbd", "backward-euler", "bdf2"],
+)
+def test_order_of_convergence(reference, make, order, within, substeps):
+    scene, truth = reference
+    error = [rms(last(scene, make(n)), truth) for n in substeps]
+    fitted = -np.polyfit(np.log2(substeps), np.log2(error), 1)[0]
+    assert fitted == pytest.approx(order, abs=within), error
+
+
+def test_doing_nothing_is_the_worst_of_all(reference):
+    """The comparison itself: a sheet that only falls must land far off."""
+    scene, truth = reference
+    free = dataclasses.replace(scene, effects=scene.effects[:1])
+    assert rms(last(free, XPBD(32, 1)), truth) > 100 * rms(last(scene, XPBD(32, 4)), truth)
+
+
+@pytest.mark.parametrize("effects", [(Membrane(), Dihedral()), (Stretch(), Dihedral())])
+def test_solvers_agree_on_every_elastic_effect(effects):
+    scene = swinging(effects)
+    truth = last(scene, Verlet(substeps=1024, queries=1), 3)
+    moved = rms(truth, scene.assembly.rest)
+    for solver in (XPBD(128, 4), Implicit(64, 1, order=2, newton=2)):
+        assert rms(last(scene, solver, 3), truth) < 0.02 * moved, solver
+
+
+def test_gradients_by_implicit_differentiation_agree_with_differences():
+    scene = swinging()
+    solver = Implicit(8, 1, order=2, newton=2, tolerance=1e-6)
+    system = scene.system(solver)
+    body = scene.assembly.body
+    heads = body.joint_positions(jnp.asarray(scene.assembly.rest_body, jnp.float32))[0]
+    pose = jnp.repeat(body.a_pose()[None, None], 3, axis=0)
+    root = jnp.repeat(heads[:1][None], 3, axis=0)
+    x = jnp.asarray(scene.assembly.rest.astype(np.float32))[:, :, None]
+
+    def height(lift):
+        v = jnp.zeros_like(x).at[:, 1].set(lift)
+        state = State(x, v, solver.remember(v, 1 / (30.0 * 8)))
+        _, moved, _ = advance(system, state, pose, root, solver=solver, fps=30.0)
+        return moved[-1, :, 1].mean()
+
+    slope = float(jax.grad(height)(jnp.float32(0.2)))
+    step = 2e-2
+    ends = [float(height(jnp.float32(0.2 + s))) for s in (step, -step)]
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_step_of_a_second_stays_finite(order):
+    scene = swinging()
+    out = simulate_still(scene, 5, solver=Implicit(1, 1, order=order, newton=3), fps=1.0)
+    assert out.finite.all() and np.abs(out.positions[0]).max() < 10
+
+
+def test_float64_stays_inside():
+    last(swinging(), XPBD(4, 1, "float64"), 1)
+    assert jnp.zeros(2).dtype == jnp.float32
+
+
+def test_settings_that_make_no_sense_are_refused():
+    for wrong in (
+        lambda: XPBD(10, 4),
+        lambda: XPBD(8, 2, "float16"),
+        lambda: Implicit(8, 1, order=3),
+        lambda: Implicit(8, 1, newton=0),
+    ):
+        with pytest.raises(ValueError, match=r"substeps|precision|order|newton"):
+            wrong()
+    with pytest.raises(SimulationError, match="accuracy"):
+        simulate(Scene((square_sheet(3),)), load_motion("balance", fps=30.0), accuracy="best")
+    assert ACCURACY["draft"].substeps < ACCURACY["fine"].substeps
+
+
+def test_status_names_frame_and_vertex_of_a_breakdown():
+    g = square_sheet(4, 0.3)
+    scene = prepare_scene(Scene((g,), (Gravity(), Stretch())))
+    x = np.asarray(g.mesh.vertices).copy()
+    x[5] = np.nan
+    out = simulate_still(scene, 2, solver=XPBD(4, 1), start=x)
+    assert (out.status & Status.NONFINITE).all()
+    with pytest.raises(SimulationError, match="frame 0, vertex"):
+        out.check()
+    fine = simulate_still(scene, 2, solver=XPBD(4, 1))
+    assert not fine.status.any()
+    fine.check()
+
+
+def test_energies_are_given_only_if_asked_and_add_up():
+    scene = swinging()
+    out = simulate_still(scene, 10, solver=Verlet(512, 1), energies=True)
+    d = out.diagnostics
+    mass = scene.assembly.mass
+    free = ~scene.assembly.pinned
+    height = (out.positions[0][:, free, 1] - scene.assembly.rest[free, 1]) @ mass[free]
+    total = d["energy_kinetic"] + d["energy_stretch"] + d["energy_bend"] + 9.81 * height
+    assert np.ptp(total) < 0.01 * d["energy_kinetic"].max()
+    plain = simulate_still(scene, 1, solver=XPBD(4, 1)).diagnostics
+    assert not any(k.startswith("energy") for k in plain)
