@@ -85,13 +85,12 @@ def test_doing_nothing_is_the_worst_of_all(reference):
     assert rms(last(free, XPBD(32, 1)), truth) > 100 * rms(last(scene, XPBD(32, 4)), truth)
 
 
-@pytest.mark.parametrize("effects", [(Membrane(), Dihedral()), (Stretch(), Dihedral())])
-def test_solvers_agree_on_every_elastic_effect(effects):
-    scene = swinging(effects)
-    truth = last(scene, Verlet(substeps=1024, queries=1), 3)
+def test_solvers_agree_on_membrane_and_dihedral_bending():
+    scene = swinging((Membrane(), Dihedral()))
+    truth = last(scene, Verlet(substeps=512, queries=1), 2)
     moved = rms(truth, scene.assembly.rest)
-    for solver in (XPBD(128, 4), Implicit(64, 1, order=2, newton=2)):
-        assert rms(last(scene, solver, 3), truth) < 0.02 * moved, solver
+    for solver in (XPBD(64, 4), Implicit(32, 1, order=2, newton=2)):
+        assert rms(last(scene, solver, 2), truth) < 0.02 * moved, solver
 
 
 def test_gradients_by_implicit_differentiation_agree_with_differences():

@@ -77,3 +77,22 @@ class Clips:
 
     debug: bool = False
     """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Stress:
+    """Run the simulator's hard cases: what is measured, its bound, whether it holds.
+
+    Examples:
+      physxnet stress
+      physxnet stress --cases free_fall scrambled_start --json stress.json
+    """
+
+    cases: tuple[str, ...] = ()
+    """Names of cases; all of them if none is given."""
+    json: pathlib.Path | None = None
+    """Write the rows to this file."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""

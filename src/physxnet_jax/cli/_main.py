@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import BrokenInstallError, PhysXNetError
-from ._commands import Clips, Demo, Doctor, Dress
+from ._commands import Clips, Demo, Doctor, Dress, Stress
 from ._doctor import doctor
 
 _Command = (
@@ -18,6 +18,7 @@ _Command = (
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Clips, tyro.conf.subcommand("clips")]
+    | Annotated[Stress, tyro.conf.subcommand("stress")]
 )
 
 
@@ -54,7 +55,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _run(command: Dress | Demo | Doctor | Clips, console: Console) -> int:
+def _run(command: Dress | Demo | Doctor | Clips | Stress, console: Console) -> int:
+    if isinstance(command, Stress):
+        from ._stress import stress
+
+        return stress(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Doctor):
         return doctor(console)
     if isinstance(command, Clips):

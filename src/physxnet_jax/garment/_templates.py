@@ -140,7 +140,7 @@ def stored_arrays(garment: Garment) -> dict[str, np.ndarray]:
         "refs": np.asarray(garment.refs).astype(np.uint16),
         "ref_weights": garment.ref_weights,
         "offset": garment.offset,
-        "fabric": np.asarray(dataclasses.astuple(garment.fabric)),
+        "fabric": np.asarray(dataclasses.astuple(garment.fabric)[:5], np.float64),
     }
     return {f"{garment.name}_{k}": np.asarray(v) for k, v in values.items()}
 

@@ -5,13 +5,13 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
-from ...geometry import hinges
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
 from ._coloured import Coloured, Constraint, Group, colour_groups
+from ._hinge import bending_hinges
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,8 +20,8 @@ class Dihedral(Effect):
 
     ``theta`` is the signed angle between the normals, flat at rest. Unlike `Bend` it
     stays right when the cloth stretches or folds back. What hinges make of a curvature
-    depends on how the mesh is cut (`Bend` says how much); ``c`` is chosen once a mesh
-    so that cylinders store the right energy on average over their directions.
+    depends on how the mesh is cut; ``c`` is chosen a hinge so that cylinders of all
+    directions store the right energy (see `bending_hinges`).
 
     References:
         Grinspun et al., Discrete shells (2003), equation 2 with the flat rest angle;
@@ -30,72 +30,9 @@ class Dihedral(Effect):
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Colours the hinges so that a Gauss-Seidel sweep runs group by group."""
-        quads = hinges(assembly.faces)
-        _, area = hinge_stencils(assembly.rest, quads)
-        x = assembly.rest
-        length = np.linalg.norm(x[quads[:, 1]] - x[quads[:, 0]], axis=1)
-        usable = (area > 1e-10) & (length > 1e-6)
-        quads, area, length = quads[usable], area[usable], length[usable]
-        k = hinge_stiffness(assembly, quads) * length**2 / area
-        k *= _calibration(x, quads, area, length)
-        law = {"compliance": 1.0 / np.maximum(k, 1e-12)}
-        return _Dihedral(colour_groups(quads, np.asarray(inverse_mass), law))
-
-
-def hinge_stencils(
-    x: Float[np.ndarray, "vertices 3"], quads: Int[np.ndarray, "hinges 4"]
-) -> tuple[Float[np.ndarray, "hinges 4"], Float[np.ndarray, " hinges"]]:
-    """Coefficients of (a, b, left, right) and the area of both triangles."""
-    a, b, p, q = (x[quads[:, i]] for i in range(4))
-
-    def cot(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        sine = np.linalg.norm(np.cross(u, v), axis=1)
-        return np.einsum("ij,ij->i", u, v) / np.maximum(sine, 1e-9)
-
-    at_a = cot(b - a, p - a), cot(b - a, q - a)
-    at_b = cot(a - b, p - b), cot(a - b, q - b)
-    c = np.column_stack(
-        [at_b[0] + at_b[1], at_a[0] + at_a[1], -at_a[0] - at_b[0], -at_a[1] - at_b[1]]
-    )
-    area = 0.5 * (
-        np.linalg.norm(np.cross(b - a, p - a), axis=1)
-        + np.linalg.norm(np.cross(b - a, q - a), axis=1)
-    )
-    return c, area
-
-
-def hinge_stiffness(
-    assembly: Assembly, quads: Int[np.ndarray, "hinges 4"]
-) -> Float[np.ndarray, " hinges"]:
-    """Bending stiffness [N m] of each hinge, its garment's."""
-    of_vertex = np.zeros(len(assembly.rest))
-    of_vertex[assembly.faces] = assembly.bend[:, None]
-    return of_vertex[quads[:, 0]]
-
-
-def _calibration(
-    x: Float[np.ndarray, "vertices 3"],
-    quads: Int[np.ndarray, "hinges 4"],
-    area: Float[np.ndarray, " hinges"],
-    length: Float[np.ndarray, " hinges"],
-) -> float:
-    """What brings the energy of cylinders, over all directions, to ``A kappa^2 / 2``."""
-    a, b, p, q = (x[quads[:, i]] for i in range(4))
-    along = (b - a) / length[:, None]
-    # Both triangles unfolded into the plane: the edge on the first axis.
-    flat = np.zeros((len(quads), 4, 2))
-    flat[:, 1, 0] = length
-    for k, (corner, side) in enumerate(((p, 1.0), (q, -1.0)), start=2):
-        u = np.einsum("ij,ij->i", corner - a, along)
-        flat[:, k, 0] = u
-        flat[:, k, 1] = side * np.linalg.norm(corner - a - u[:, None] * along, axis=1)
-    lifted = np.concatenate([flat, np.zeros((*flat.shape[:2], 1))], axis=2)
-    c, _ = hinge_stencils(lifted.reshape(-1, 3), np.arange(4 * len(quads)).reshape(-1, 4))
-    measured = 0.0
-    for angle in np.arange(8) * np.pi / 8:
-        height = 0.5 * (flat @ [np.cos(angle), np.sin(angle)]) ** 2
-        measured += float(np.sum(np.einsum("hk,hk->h", c, height) ** 2 / area)) / 8
-    return float(area.sum() / 3) / max(measured, 1e-12)
+        h = bending_hinges(assembly)
+        law = {"compliance": 1.0 / np.maximum(h.stiffness * h.length**2, 1e-12)}
+        return _Dihedral(colour_groups(h.corners, np.asarray(inverse_mass), law))
 
 
 @pytree

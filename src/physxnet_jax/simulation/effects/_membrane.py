@@ -11,6 +11,7 @@ from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
 from ._coloured import Coloured, Constraint, Group, colour_groups
+from ._hinge import sound
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,9 +34,9 @@ class Membrane(Effect):
     compression: float = 0.2
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Colours the triangles; those without area are left out."""
+        """Colours the triangles; slivers are left out."""
         faces, area, inverse = rest_frames(assembly)
-        usable = area > 1e-10
+        usable = sound(assembly.rest, faces)
         a = area[usable]
         fabric = assembly.membrane[usable]
         law = {
