@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..body import load_body
-from ..garment import Fabric, Garment, free_garment, square_sheet, template
+from ..garment import Fabric, Garment, Template, free_garment, square_sheet, template
 from ..motion import Motion, load_motion
 from ..simulation import (
     STANDARD,
@@ -67,7 +67,7 @@ CASES: dict[str, Case] = {}
 
 def run_case(name: str) -> list[Finding]:
     """Runs one case of `CASES`."""
-    return [Finding(name, *row) for row in CASES[name]()]
+    return [Finding(name, what, float(b), float(m)) for what, b, m in CASES[name]()]
 
 
 def _case(function: Case) -> Case:
@@ -301,8 +301,8 @@ def an_effect_that_touches_nothing() -> Iterator[tuple[str, float, float]]:
     yield "bits changed (largest difference, m)", 0, float(np.abs(plain - more).max())
 
 
-def _worn(motion: Motion) -> Rollout:
-    return simulate_batch(prepare_scene(Scene((template("top"),), STANDARD)), [motion])[0]
+def _worn(motion: Motion, name: Template = "top") -> Rollout:
+    return simulate_batch(prepare_scene(Scene((template(name),), STANDARD)), [motion])[0]
 
 
 def _body_rows(out: Rollout) -> Iterator[tuple[str, float, float]]:
@@ -324,7 +324,9 @@ def a_teleport_of_two_metres() -> Iterator[tuple[str, float, float]]:
     m = load_motion("balance", fps=_FPS)
     root = np.asarray(m.root[:30]).copy()
     root[10:] += [2.0, 0.0, 0.0]
-    out = _worn(dataclasses.replace(m, rotations=m.rotations[:30], root=jnp.asarray(root)))
+    out = _worn(
+        dataclasses.replace(m, rotations=m.rotations[:30], root=jnp.asarray(root)), "bottom"
+    )
     yield from _body_rows(out)
     calm = np.flatnonzero(out.diagnostics["strain_p99"][10:] < 0.3)
     yield "frames until 99 % of edges are within 30 %", 15, float(calm[0] if len(calm) else np.inf)
