@@ -30,7 +30,7 @@ from physxnet_jax.simulation import (
     simulate_still,
 )
 
-SOFT = Fabric(stretch=300.0, bend=1e-4, warp=300.0, weft=300.0, shear=50.0)
+SOFT = Fabric(stretch=300.0, bend=1e-5, warp=300.0, weft=300.0, shear=50.0)
 
 
 SPRINGS = (Stretch(compression=1.0), Bend())

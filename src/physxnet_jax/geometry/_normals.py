@@ -1,5 +1,6 @@
 """Face and vertex normals that stay finite on degenerate triangles."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -22,6 +23,7 @@ def face_normals(
     return safe_normalize(jnp.cross(b - a, c - a))
 
 
+@jax.jit
 def vertex_normals(
     vertices: Float[Array, "*batch vertices 3"], faces: Int[Array, "faces 3"]
 ) -> Float[Array, "*batch vertices 3"]:

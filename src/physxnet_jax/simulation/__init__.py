@@ -28,8 +28,11 @@ from .effects import (
     Damping as Damping,
     Dihedral as Dihedral,
     Gravity as Gravity,
+    LayerContact as LayerContact,
     Membrane as Membrane,
     Pin as Pin,
+    Seam as Seam,
+    SelfContact as SelfContact,
     StrainLimit as StrainLimit,
     Stretch as Stretch,
 )

@@ -22,12 +22,14 @@ class Status(enum.IntFlag):
     """A vertex more than 1 cm inside the body."""
     MISSED = 16
     """Contact may have missed the closest skin, see `BodyContact`."""
-    PINCHED = 32
-    """Cloth between two limbs that leave it no room."""
-    FAST = 64
+    FAST = 32
     """A vertex faster than 50 m/s."""
-    OVERFLOW = 128
-    """A list of self-contacts was too short."""
+    PINCHED = 64
+    """Cloth that lies within another limb than its own: the body intersects itself."""
+    CROSSED = 128
+    """Layers in the wrong order somewhere."""
+    OVERFLOW = 256
+    """More vertices in one place than self-contact has room for."""
 
 
 _STRAIN, _INSIDE, _SPEED = 0.5, 0.01, 50.0
@@ -50,11 +52,13 @@ class Rollout:
             ``worst_vertex`` (the fastest), ``residual_max`` and ``residual_p99``
             (1 is the tolerance of 0.5 mm), and what the scene's effects add:
             ``strain_max``, ``strain_p99`` [1], ``penetration_max`` [m],
-            ``inside_share``, ``missed``, ``pinched``; ``energy_...`` [J] if asked for.
+            ``inside_share``, ``missed``, ``pinched`` (vertices), ``layers_crossed``,
+            ``layers_depth`` [m], ``self_gap`` [m], ``overflow``; ``energy_...`` [J] if
+            asked for.
         name: Of the motion.
     """
 
-    positions: tuple[Float[np.ndarray, "frames vertices 3"], ...]
+    positions: tuple[Float[np.ndarray, "frames _ 3"], ...]
     fps: float
     diagnostics: dict[str, np.ndarray]
     name: str = ""
@@ -79,8 +83,9 @@ class Rollout:
             | bit(Status.STRAINED, ~(d.get("strain_max", nothing) <= _STRAIN))
             | bit(Status.INSIDE, ~(d.get("penetration_max", nothing) <= _INSIDE))
             | bit(Status.MISSED, d.get("missed", nothing) > 0)
-            | bit(Status.PINCHED, d.get("pinched", nothing) > 0)
             | bit(Status.FAST, ~(d["speed_max"] <= _SPEED))
+            | bit(Status.PINCHED, d.get("pinched", nothing) > 0)
+            | bit(Status.CROSSED, d.get("layers_crossed", nothing) > 0)
             | bit(Status.OVERFLOW, d.get("overflow", nothing) > 0)
         )
 

@@ -94,13 +94,17 @@ class Implicit(Solver):
             held = x
             worst = jnp.zeros((d.shape[0], d.shape[2]), d.dtype)
             if elastic:
-                for _ in range(self.newton):
+
+                def newton(_: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
+                    x = at[0]
                     slope = free * (mass * (x - goal) + reach * reach * jax.grad(stored)(x))
                     blocks = pattern.assemble(elastic, x, mass, reach)
-                    x = x - free * self._solve(pattern, blocks, free, slope)
+                    stiff = pattern.diagonal(blocks, free).mean(axis=(-1, -2)) * 3
+                    return x - free * self._solve(pattern, blocks, free, slope), stiff
+
+                x, stiff = jax.lax.fori_loop(0, self.newton, newton, (x, worst))
                 slope = free * (mass * (x - goal) + reach * reach * jax.grad(stored)(x))
-                stiff = jnp.maximum(pattern.diagonal(blocks, free).mean(axis=(-1, -2)) * 3, 1e-30)
-                worst = jnp.sqrt(jnp.sum(slope * slope, axis=1)) / stiff
+                worst = jnp.sqrt(jnp.sum(slope * slope, axis=1)) / jnp.maximum(stiff, 1e-30)
             else:
                 x = jnp.where(free > 0, goal, held)
             predicted = x

@@ -61,7 +61,7 @@ ACCURACY: dict[str, Solver] = {
     "standard": XPBD(substeps=32, queries=4),
     "fine": XPBD(substeps=128, queries=8),
 }
-"""The one knob: what each step costs and brings stands in docs/accuracy-cost.md."""
+"""The one knob. Cost is proportional to the substeps, the error about inversely."""
 
 
 def simulate(
@@ -178,7 +178,10 @@ def _roll(
     x = jnp.stack(start, axis=2).astype(solver.precision)
     state = State(x, jnp.zeros_like(x))
     state = dataclasses.replace(
-        state, memory=solver.remember(state.velocity, 1.0 / (fps * solver.substeps))
+        state,
+        memory=solver.remember(state.velocity, 1.0 / (fps * solver.substeps)),
+        # Filled in here, or the second block would be another program to compile.
+        kept=tuple(e.initial(len(motions)) for e in system.effects),
     )
     # Time zero is the clip's first frame, whatever the lead-in's length.
     began = -(skipped - 1) / fps

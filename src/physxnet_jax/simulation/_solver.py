@@ -1,5 +1,6 @@
 """What a solver is: how a block of substeps moves the cloth."""
 
+import abc
 import dataclasses
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +18,7 @@ TOLERANCE = 5e-4
 
 
 @dataclasses.dataclass(frozen=True)
-class Solver:
+class Solver(abc.ABC):
     """Settings that every solver has.
 
     Attributes:
@@ -46,6 +47,7 @@ class Solver:
         """What `State.memory` holds at the start."""
         return ()
 
+    @abc.abstractmethod
     def block(
         self,
         system: System,
@@ -68,7 +70,6 @@ class Solver:
         Returns:
             Displacement over the block [m], velocity at its end, and the memory.
         """
-        raise NotImplementedError
 
     def residual(
         self,

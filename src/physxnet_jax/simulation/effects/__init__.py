@@ -6,7 +6,10 @@ from ._contact import BodyContact as BodyContact
 from ._damping import Damping as Damping
 from ._dihedral import Dihedral as Dihedral
 from ._gravity import Gravity as Gravity
+from ._layers import LayerContact as LayerContact
 from ._membrane import Membrane as Membrane
 from ._pin import Pin as Pin
+from ._seam import Seam as Seam
+from ._self_contact import SelfContact as SelfContact
 from ._strain_limit import StrainLimit as StrainLimit
 from ._stretch import Stretch as Stretch

@@ -74,7 +74,7 @@ class Air(Effect):
             jnp.asarray(f),
             jnp.asarray(around),
             float32(once)[:, :, None, None],
-            float32(0.5 * self.density * share / assembly.mass)[:, None, None],
+            float32((0.5 * self.density * share / assembly.mass)[:, None, None]),
             modes,
             self,
         )

@@ -11,7 +11,7 @@ from ...geometry import greedy_colours
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, Prepared
-from ._coloured import scatter_rows
+from ._coloured import corner_pairs, joined, scatter_rows
 from ._hinge import bending_hinges
 
 
@@ -40,10 +40,10 @@ class Bend(Effect):
             groups.append(
                 _Group(
                     tuple(jnp.asarray(index[:, i]) for i in range(4)),
-                    tuple(float32(c[:, i])[:, None, None] for i in range(4)),
-                    tuple(float32(w[index[:, i]] * c[:, i])[:, None, None] for i in range(4)),
-                    float32((w[index] * c * c).sum(axis=1))[:, None, None],
-                    float32(1.0 / np.maximum(k[members], 1e-12))[:, None, None],
+                    tuple(float32(c[:, i][:, None, None]) for i in range(4)),
+                    tuple(float32((w[index[:, i]] * c[:, i])[:, None, None]) for i in range(4)),
+                    float32(((w[index] * c * c).sum(axis=1))[:, None, None]),
+                    float32((1.0 / np.maximum(k[members], 1e-12))[:, None, None]),
                 )
             )
         return _Bend(tuple(groups))
@@ -99,25 +99,21 @@ class _Bend(Prepared):
         return d
 
     def energy(self, displacement: Array, context: tuple[Array, ...]) -> Array:
-        total = jnp.zeros(displacement.shape[2:], displacement.dtype)
-        for g, flat in zip(self.groups, context, strict=True):
-            curvature = flat
-            for c, i in zip(g.coefficient, g.index, strict=True):
-                curvature = curvature + c * displacement[i]
-            total = total + 0.5 * jnp.sum(curvature**2 / g.compliance, axis=(0, 1))
-        return total
+        if not self.groups:
+            return jnp.zeros(displacement.shape[2:], displacement.dtype)
+        g, curvature = joined(self.groups), jnp.concatenate(context)
+        for c, i in zip(g.coefficient, g.index, strict=True):
+            curvature = curvature + c * displacement[i]
+        return 0.5 * jnp.sum(curvature**2 / g.compliance, axis=(0, 1))
 
     def coupled(self) -> Int[np.ndarray, "blocks 2"]:
-        out = [np.zeros((0, 2), np.int64)]
-        for g in self.groups:
-            corners = [np.asarray(i) for i in g.index]
-            out += [np.column_stack([a, b]) for a in corners for b in corners]
-        return np.concatenate(out)
+        none = np.zeros((0, 2), np.int64)
+        return corner_pairs(joined(self.groups).index) if self.groups else none
 
     def constant_stiffness(self) -> Float[np.ndarray, " blocks"]:
-        out = [np.zeros(0)]
-        for g in self.groups:
-            c = [np.asarray(x)[:, 0, 0] for x in g.coefficient]
-            k = 1.0 / np.asarray(g.compliance)[:, 0, 0]
-            out += [k * a * b for a in c for b in c]
-        return np.concatenate(out)
+        if not self.groups:
+            return np.zeros(0)
+        g = joined(self.groups)
+        c = [np.asarray(x)[:, 0, 0] for x in g.coefficient]
+        k = 1.0 / np.asarray(g.compliance)[:, 0, 0]
+        return np.concatenate([k * a * b for a in c for b in c])

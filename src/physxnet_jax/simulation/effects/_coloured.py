@@ -1,8 +1,10 @@
 """Constraints in groups that share no vertex: one Gauss-Seidel sweep, and their energy."""
 
+import abc
 import dataclasses
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -16,6 +18,17 @@ from .._effect import Clock, Prepared
 def scatter_rows(target: Array, index: list[Int[Array, " members"]], rows: list[Array]) -> Array:
     """Rows put back where they were gathered from; no index occurs twice."""
     return target.at[jnp.concatenate(index)].set(jnp.concatenate(rows), unique_indices=True)
+
+
+def corner_pairs(index: tuple[Int[Array, " members"], ...]) -> Int[np.ndarray, "blocks 2"]:
+    """Every ordered pair of corners of every element, pair by pair."""
+    corners = [np.asarray(i) for i in index]
+    return np.concatenate([np.column_stack([a, b]) for a in corners for b in corners])
+
+
+def joined(parts: tuple[Any, ...]) -> Any:
+    """Groups, or what belongs to them, as one: what sums over all needs no colours."""
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
 class Constraint(NamedTuple):
@@ -67,16 +80,16 @@ def colour_groups(
             Group(
                 tuple(jnp.asarray(corners[:, i]) for i in range(corners.shape[1])),
                 tuple(
-                    float32(inverse_mass[corners[:, i]])[:, None, None]
+                    float32(inverse_mass[corners[:, i]][:, None, None])
                     for i in range(corners.shape[1])
                 ),
-                {k: float32(v[members])[:, None, None] for k, v in law.items()},
+                {k: float32(v[members][:, None, None]) for k, v in law.items()},
             )
         )
     return tuple(groups)
 
 
-class Coloured(Prepared):
+class Coloured(Prepared, abc.ABC):
     """An effect made of scalar constraints: say `measure`, and the rest follows.
 
     Corners are handed over relative to the first one and built from differences, so
@@ -86,9 +99,9 @@ class Coloured(Prepared):
     elastic = True
     groups: tuple[Group, ...]
 
+    @abc.abstractmethod
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
         """Functions that give each `Constraint` of a group in turn, from its corners."""
-        raise NotImplementedError
 
     def begin(self, base: Array, start: Any, end: Any, clock: Clock, memory: Any) -> tuple:
         return tuple(tuple(base[i] - base[g.index[0]] for i in g.index[1:]) for g in self.groups)
@@ -127,33 +140,32 @@ class Coloured(Prepared):
 
     def energy(self, displacement: Array, context: tuple) -> Array | None:
         total = jnp.zeros(displacement.shape[2:], displacement.dtype)
-        for g, edges in zip(self.groups, context, strict=True):
-            corners = self._corners([displacement[i] for i in g.index], edges)
-            for law in self.measure(g.law, corners):
-                c = law(corners)
-                total = total + 0.5 * jnp.sum(c.value**2 / c.compliance, axis=(0, 1))
+        if not self.groups:
+            return total
+        g = joined(self.groups)
+        corners = self._corners([displacement[i] for i in g.index], joined(context))
+        for law in self.measure(g.law, corners):
+            c = law(corners)
+            total = total + 0.5 * jnp.sum(c.value**2 / c.compliance, axis=(0, 1))
         return total
 
     def coupled(self) -> Int[np.ndarray, "blocks 2"]:
-        out = []
-        for g in self.groups:
-            corners = [np.asarray(i) for i in g.index]
-            out += [np.column_stack([a, b]) for a in corners for b in corners]
-        return np.concatenate(out) if out else np.zeros((0, 2), np.int64)
+        none = np.zeros((0, 2), np.int64)
+        return corner_pairs(joined(self.groups).index) if self.groups else none
 
-    def hessian(self, displacement: Array, context: tuple) -> Array:
+    def hessian(self, displacement: Array, context: tuple) -> Array | None:
         """Gauss-Newton blocks: stiffness times outer products of the gradients."""
-        out = []
-        for g, edges in zip(self.groups, context, strict=True):
-            corners = self._corners([displacement[i] for i in g.index], edges)
-            sums: dict[tuple[int, int], Array] = {}
-            for law in self.measure(g.law, corners):
-                c = law(corners)
-                n = [jnp.swapaxes(x, 1, 2) for x in c.gradients]
-                k = jnp.swapaxes(1.0 / c.compliance, 1, 2)[..., None]
-                for a in range(len(n)):
-                    for b in range(len(n)):
-                        block = k * n[a][..., :, None] * n[b][..., None, :]
-                        sums[a, b] = sums[a, b] + block if (a, b) in sums else block
-            out += [sums[a, b] for a in range(len(g.index)) for b in range(len(g.index))]
-        return jnp.concatenate(out)
+        if not self.groups:
+            return None
+        g = joined(self.groups)
+        corners = self._corners([displacement[i] for i in g.index], joined(context))
+        sums: dict[tuple[int, int], Array] = {}
+        for law in self.measure(g.law, corners):
+            c = law(corners)
+            n = [jnp.swapaxes(x, 1, 2) for x in c.gradients]
+            k = jnp.swapaxes(1.0 / c.compliance, 1, 2)[..., None]
+            for a in range(len(n)):
+                for b in range(len(n)):
+                    block = k * n[a][..., :, None] * n[b][..., None, :]
+                    sums[a, b] = sums[a, b] + block if (a, b) in sums else block
+        return jnp.concatenate([sums[p] for p in sums])

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES, Body, triangulate
@@ -13,28 +13,7 @@ from ...geometry import closest_barycentric, spread_points, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Attached, Clock, Effect, Placed, Prepared
-
-# Groups of joints between which a tight garment doesn't slide.
-_LIMBS = {
-    "LeftLeg": ("LeftUpLeg", "LeftLeg", "LeftFoot", "LeftToeBase"),
-    "RightLeg": ("RightUpLeg", "RightLeg", "RightFoot", "RightToeBase"),
-    "LeftArm": (
-        "LeftArm",
-        "LeftForeArm",
-        "LeftHand",
-        "LThumb",
-        "LeftFingerBase",
-        "LeftHandFinger1",
-    ),
-    "RightArm": (
-        "RightArm",
-        "RightForeArm",
-        "RightHand",
-        "RThumb",
-        "RightFingerBase",
-        "RightHandFinger1",
-    ),
-}
+from ._limbs import LOWER_ARMS, TRUNK, UPPER_ARMS, limb_labels
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,11 +27,13 @@ class BodyContact(Effect):
     Cloth that lies on the skin *tracks* it: the search starts at the skin point of the
     block before and walks over the surface, so the cloth may slide any distance but never
     jumps to the far side of a limb, to another limb, or across a fold where the body
-    passes through itself. Cloth pinched between two limbs keeps to its own. Hanging
-    cloth compares a list of patches over all limbs within reach instead.
+    passes through itself. Cloth pinched between two limbs keeps to its own, and is
+    counted (``pinched``). Hanging cloth compares a list of patches over all limbs within
+    reach instead.
 
     Attributes:
-        patch: Triangles around a skin vertex that are compared exactly.
+        patch: Triangles around the nearest skin vertex that are compared exactly.
+        ring: Skin vertices that a step of the walk chooses from.
         hops: Steps of the walk a block; each reaches about two centimetres.
         centres: Patches in the list of a hanging vertex.
         spacing: Distance between them [m].
@@ -65,16 +46,18 @@ class BodyContact(Effect):
         move, Mueller et al., Position based dynamics (2007), section 3.4.
     """
 
-    patch: int = 24
-    hops: int = 2
+    patch: int = 12
+    ring: int = 16
+    hops: int = 3
     centres: int = 96
     spacing: float = 0.026
     push: float = 1.0
     leave: float = 1.0
 
     def __post_init__(self) -> None:
-        if min(self.patch, self.hops, self.centres) < 1 or self.spacing <= 0 or self.push <= 0:
-            raise ValueError(f"{self}: patch, hops, centres, spacing and push must be positive.")
+        least = min(self.patch, self.ring, self.hops, self.centres)
+        if least < 1 or self.spacing <= 0 or self.push <= 0:
+            raise ValueError(f"{self}: every count, spacing and push must be positive.")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Patches around skin vertices, and where each cloth vertex starts."""
@@ -82,7 +65,7 @@ class BodyContact(Effect):
         skin = assembly.rest_body[:NUM_BODY_VERTICES]
         faces = np.asarray(triangulate(body.quads))
         weights = np.asarray(body.weights)[:NUM_BODY_VERTICES]
-        label = _limb_labels(weights, body)
+        label = _limbs(weights, body)
         loose = np.flatnonzero(assembly.loose)
         tight = np.flatnonzero(~assembly.loose)
         # Only skin that cloth can get to takes part: far parts are not even skinned.
@@ -95,6 +78,8 @@ class BodyContact(Effect):
         kept = np.flatnonzero(np.isin(faces, used).all(axis=1))
         size = min(self.patch, len(kept))
         far, near = KDTree(skin[faces[kept]].mean(axis=1)).query(skin[used], k=size)
+        far, near = far.reshape(len(used), size), near.reshape(len(used), size)
+        ring = KDTree(skin[used]).query(skin[used], k=min(self.ring, len(used)))[1]
         local = np.zeros(len(skin), dtype=np.int32)
         local[used] = np.arange(len(used))
         normals = vertex_normals(float32(skin), jnp.asarray(faces))
@@ -104,22 +89,31 @@ class BodyContact(Effect):
         w = np.asarray(inverse_mass)
         return _Contact(
             attached,
-            jnp.asarray(near.reshape(len(used), size).astype(np.int32)),
-            float32(far.reshape(len(used), size)[:, -1]),
+            jnp.asarray(ring.reshape(len(used), -1).astype(np.int32)),
+            jnp.asarray(near.T.astype(np.int32)),
+            jnp.asarray(np.moveaxis(local[faces[kept]][near], 0, 2)),
+            float32(far[:, -1]),
             jnp.asarray(local[faces[kept]]),
             jnp.asarray(tight.astype(np.int32)),
             jnp.asarray(loose.astype(np.int32)),
             jnp.asarray(local[start]),
             jnp.asarray(local[listed]),
-            float32(assembly.thickness)[:, None],
-            float32(assembly.friction)[:, None],
-            float32(w > 0)[:, None],
+            float32(assembly.thickness[:, None]),
+            float32(assembly.friction[:, None]),
+            float32((w > 0)[:, None]),
+            *_others(assembly, skin, used, label),
             self.push,
             self.leave,
             self.hops,
         )
 
 
+# Of other limbs only skin farther than this at rest can pinch [m].
+_APART = 0.06
+# Nor skin farther above than this [m].
+_DEEP = 0.10
+# Distance between the samples of the skin that pinching is looked for at [m].
+_SAMPLE = 0.03
 # Cloth this little above its thickness touches the skin [m].
 _NEAR = 0.001
 # Skin farther than this from all cloth at rest takes no part [m].
@@ -134,12 +128,12 @@ def _start(
     rows: Int[np.ndarray, " tight"],
 ) -> Int[np.ndarray, " tight"]:
     """The skin vertex nearest to each cloth vertex at rest, on its own limb."""
-    cloth = _limb_labels(assembly.weights, assembly.body)[rows]
+    cloth = _limbs(assembly.weights, assembly.body)[rows]
     out = np.zeros(len(rows), dtype=np.int64)
     for lab in np.unique(cloth):
         mine = cloth == lab
         # Arms and legs keep to themselves; the trunk's cloth may start anywhere.
-        pool = used if lab == 0 else used[(label[used] == lab) | (label[used] == 0)]
+        pool = used if lab == TRUNK else used[(label[used] == lab) | (label[used] == TRUNK)]
         pool = pool if len(pool) else used
         out[mine] = pool[KDTree(skin[pool]).query(assembly.rest[rows[mine]])[1]]
     return out
@@ -159,22 +153,67 @@ def _listed(
     return pool[KDTree(skin[pool]).query(assembly.rest[rows], k=k)[1].reshape(len(rows), k)]
 
 
-def _limb_labels(
-    weights: Float[np.ndarray, "points joints"], body: Body
-) -> Int[np.ndarray, " points"]:
-    """0 for the trunk, else the limb that carries most of the weight."""
-    share = np.stack(
-        [weights[:, [body.joint(n) for n in names]].sum(axis=1) for names in _LIMBS.values()],
-        axis=1,
-    )
-    return np.where(share.max(axis=1) > 0.5, share.argmax(axis=1) + 1, 0)
+def _limbs(weights: Float[np.ndarray, "points joints"], body: Body) -> Int[np.ndarray, " points"]:
+    """Limbs between which a tight garment doesn't slide; an arm is one."""
+    label = limb_labels(weights, body)
+    for upper, lower in zip(UPPER_ARMS, LOWER_ARMS, strict=True):
+        label[label == lower] = upper
+    return label
+
+
+def _others(
+    assembly: Assembly,
+    skin: Float[np.ndarray, "body 3"],
+    used: Int[np.ndarray, " used"],
+    label: Int[np.ndarray, " body"],
+) -> tuple[Int[Array, " samples"], Bool[Array, "vertices samples"]]:
+    """Samples of the skin, and which belong to another limb than a cloth vertex."""
+    pool = np.asarray(spread_points(skin[used], _SAMPLE))
+    cloth = _limbs(assembly.weights, assembly.body)
+    other = cloth[:, None] != label[used[pool]][None]
+    near = KDTree(skin[used[pool]]).query_ball_point(assembly.rest, _APART)
+    for v, mine in enumerate(near):
+        other[v, mine] = False
+    return jnp.asarray(pool.astype(np.int32)), jnp.asarray(other & ~assembly.loose[:, None])
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class _Touch:
+    """Where each cloth vertex meets the skin in a block.
+
+    Attributes:
+        where: From the cloth to its skin point at the start [m].
+        way: How that point moves in the block [m].
+        normal: The skin's normal there at the start, not unit.
+        turn: How it changes in the block.
+        centre: Skin vertices to start from in the next block.
+        missed: The point lies beyond its patch.
+        unit: The normal at the start, unit.
+        ceiling: Fastest that touching cloth may leave [m/s].
+        base: Cloth at the start [m].
+        limbs: Samples of the skin at the end, and their normals.
+    """
+
+    where: Float[Array, "vertices 3 batch"]
+    way: Float[Array, "vertices 3 batch"]
+    normal: Float[Array, "vertices 3 batch"]
+    turn: Float[Array, "vertices 3 batch"]
+    centre: Int[Array, "tight batch"]
+    missed: Bool[Array, "vertices batch"]
+    unit: Float[Array, "vertices 3 batch"]
+    ceiling: Float[Array, "vertices 1 batch"]
+    base: Float[Array, "vertices 3 batch"]
+    limbs: tuple[Float[Array, "samples 3 batch"], Float[Array, "samples 3 batch"]]
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Contact(Prepared):
     skin: Attached
-    table: Int[Array, "skin patch"]
+    ring: Int[Array, "skin ring"]
+    table: Int[Array, "patch skin"]
+    corners: Int[Array, "patch 3 skin"]
     radius: Float[Array, " skin"]
     faces: Int[Array, "faces 3"]
     tight: Int[Array, " tight"]
@@ -184,6 +223,8 @@ class _Contact(Prepared):
     thickness: Float[Array, "vertices 1"]
     friction: Float[Array, "vertices 1"]
     free: Float[Array, "vertices 1"]
+    samples: Int[Array, " samples"]
+    others: Bool[Array, "vertices samples"]
     push: float = dataclasses.field(metadata={"static": True})
     leave: float = dataclasses.field(metadata={"static": True})
     hops: int = dataclasses.field(metadata={"static": True})
@@ -195,59 +236,58 @@ class _Contact(Prepared):
     def initial(self, batch: int) -> Int[Array, "tight batch"]:
         return jnp.repeat(self.start[:, None], batch, axis=1)
 
-    def keep(self, context: tuple[Array, ...]) -> Array:
-        return context[4]
+    def keep(self, context: _Touch) -> Array:
+        return context.centre
+
+    def walk(
+        self,
+        points: Float[Array, "some 3 batch"],
+        skin: Float[Array, "skin 3 batch"],
+        at: Int[Array, "some batch"],
+    ) -> Int[Array, "some batch"]:
+        """Over the surface to a skin vertex that has none nearer in its ring."""
+        lane = jnp.arange(points.shape[2])[None, :, None]
+        p = jnp.moveaxis(points, 1, 2)[:, :, None]
+        for _ in range(self.hops):
+            ring = self.ring[at]
+            gap = skin[ring, :, lane] - p
+            best = jnp.argmin(jnp.sum(gap * gap, axis=3), axis=2)
+            at = jnp.take_along_axis(ring, best[..., None], axis=2)[..., 0]
+        return at
 
     def closest(
         self,
         points: Float[Array, "some 3 batch"],
         skin: Float[Array, "skin 3 batch"],
         centre: Int[Array, "some batch"],
-    ) -> tuple[Array, Array, Array, Array]:
-        """Closest point on the patch around a skin vertex.
+    ) -> tuple[Array, Array]:
+        """Face and barycentric weights [3, some, batch] of the closest point on a patch."""
+        batch = points.shape[2]
+        # [patch, 3, some, batch], flat so that every gather is one of single numbers.
+        corner = self.corners[:, :, centre] * batch + jnp.arange(batch)[None, None, None]
+        flat = [skin[:, i].reshape(-1) for i in range(3)]
+        tri = [jnp.stack([f[corner[:, k]] for f in flat]) for k in range(3)]
+        p = jnp.broadcast_to(jnp.moveaxis(points, 1, 0)[:, None], tri[0].shape)
+        weights, squared = closest_barycentric(p, *tri)
+        best = jnp.argmin(squared, axis=0)
+        face = jnp.take_along_axis(self.table[:, centre], best[None], axis=0)[0]
+        weights = jnp.take_along_axis(weights, best[None, None], axis=1)[:, 0]
+        return jax.lax.stop_gradient(face), weights
 
-        Returns:
-            Face, barycentric weights [3, some, batch], the face's corner nearest to
-            the point, and the squared distance.
-        """
-        lane = jnp.arange(points.shape[2])[None]
-        patch = self.table[centre]
-        corners = [skin[self.faces[patch][..., k], :, lane[..., None]] for k in range(3)]
-        # [some, batch, patch] with the component first for element-wise work.
-        corners = [jnp.moveaxis(c, -1, 0) for c in corners]
-        p = jnp.broadcast_to(jnp.moveaxis(points, 1, 0)[..., None], corners[0].shape)
-        weights, squared = closest_barycentric(p, *corners)
-        best = jnp.argmin(squared, axis=2)
-        face = jnp.take_along_axis(patch, best[..., None], axis=2)[..., 0]
-        weights = jnp.take_along_axis(weights, best[None, ..., None], axis=3)[..., 0]
-        squared = jnp.take_along_axis(squared, best[..., None], axis=2)[..., 0]
-        corner = jnp.take_along_axis(
-            self.faces[face], jnp.argmax(weights, axis=0)[..., None], axis=2
-        )[..., 0]
+    def begin(self, base: Array, start: Placed, end: Placed, clock: Clock, memory: Array) -> _Touch:
         stop = jax.lax.stop_gradient
-        return stop(face), weights, stop(corner), squared
-
-    def begin(
-        self, base: Array, start: Placed, end: Placed, clock: Clock, memory: Array
-    ) -> tuple[Array, ...]:
-        tight = base[self.tight]
-        centre = memory
-        for _ in range(self.hops):
-            last = centre
-            face, weights, centre, _ = self.closest(tight, start.points, last)
+        points = stop(start.points)
+        centre = self.walk(stop(base[self.tight]), points, memory)
+        last = centre
         if self.loose.shape[0]:
-            loose = base[self.loose]
-            gap = start.points[self.listed] - loose[:, None]
+            loose = stop(base[self.loose])
+            gap = points[self.listed] - loose[:, None]
             pick = jnp.argmin(jnp.sum(gap * gap, axis=2), axis=1)
-            middle = jnp.take_along_axis(self.listed, pick, axis=1)
-            # The middle's own patch may be smaller than the list's mesh: walk on from there.
-            for _ in range(self.hops):
-                there = middle
-                more, other, middle, _ = self.closest(loose, start.points, there)
+            there = jnp.take_along_axis(self.listed, pick, axis=1)
+            there = self.walk(loose, points, there)
             order = jnp.argsort(jnp.concatenate([self.tight, self.loose]))
-            face = jnp.concatenate([face, more])[order]
-            weights = jnp.concatenate([weights, other], axis=1)[:, order]
-            last = jnp.concatenate([last, there])[order]
+            last = jnp.concatenate([centre, there])[order]
+        face, weights = self.closest(base, start.points, last)
         p0, n0 = _surface(start, self.faces, face, weights)
         p1, n1 = _surface(end, self.faces, face, weights)
         lane = jnp.arange(base.shape[2])[None]
@@ -258,10 +298,11 @@ class _Contact(Prepared):
         touching = height < self.thickness[..., None] + _NEAR
         fastest = jnp.sum((p1 - p0) * unit, axis=1, keepdims=True) / clock.length + self.leave
         ceiling = jnp.where(touching, fastest, jnp.inf)
-        return p0 - base, p1 - p0, n0, n1 - n0, centre, far, unit, ceiling
+        limbs = end.points[self.samples], end.normals[self.samples]
+        return _Touch(p0 - base, p1 - p0, n0, n1 - n0, centre, far, unit, ceiling, base, limbs)
 
-    def accelerate(self, velocity: Array, context: tuple[Array, ...], h: float) -> Array:
-        unit, ceiling = context[6:]
+    def accelerate(self, velocity: Array, context: _Touch, h: float) -> Array:
+        unit, ceiling = context.unit, context.ceiling
         outwards = jnp.sum(velocity * unit, axis=1, keepdims=True)
         return velocity - jnp.maximum(outwards - ceiling, 0.0) * unit
 
@@ -269,7 +310,7 @@ class _Contact(Prepared):
         self,
         displacement: Array,
         start: Array,
-        context: tuple[Array, ...],
+        context: _Touch,
         progress: Array,
         step: tuple[float, float],
     ) -> Array:
@@ -277,32 +318,46 @@ class _Contact(Prepared):
         lift = jnp.clip(depth, 0.0, self.push) * self.free[..., None]
         moved = displacement + lift * n
         # Friction acts against the skin's own way in this substep.
-        slide = (moved - start) - step[1] * context[1]
+        slide = (moved - start) - step[1] * context.way
         slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
         length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
         hold = jnp.minimum(1.0, self.friction[..., None] * lift / length)
         return moved - hold * slide
 
-    def _depth(
-        self, displacement: Array, context: tuple[Array, ...], progress: Array
-    ) -> tuple[Array, Array]:
+    def _depth(self, displacement: Array, context: _Touch, progress: Array) -> tuple[Array, Array]:
         """Unit normals, and how much of the thickness is missing [m]."""
-        where, way, normal, turn = context[:4]
-        n = normal + progress * turn
+        n = context.normal + progress * context.turn
         n = n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-12)
-        gap = displacement - (where + progress * way)
+        gap = displacement - (context.where + progress * context.way)
         height = jnp.sum(gap * n, axis=1, keepdims=True)
         return n, self.thickness[..., None] - height
 
-    def diagnose(self, displacement: Array, context: tuple[Array, ...]) -> dict[str, Array]:
+    def diagnose(self, displacement: Array, context: _Touch) -> dict[str, Array]:
         depth = self._depth(displacement, context, jnp.ones((), displacement.dtype))[1]
         inside = depth[:, 0] - self.thickness
         return {
             "penetration_max": jnp.maximum(inside.max(axis=0), 0.0),
             "inside_share": jnp.mean((inside > 0).astype(displacement.dtype), axis=0),
             # Far from the skin it doesn't matter which point is the closest.
-            "missed": jnp.sum(context[5] & (inside > -0.02), axis=0),
+            "missed": jnp.sum(context.missed & (inside > -0.02), axis=0),
+            "pinched": self._pinched(displacement, context),
         }
+
+    def _pinched(self, displacement: Array, context: _Touch) -> Array:
+        """Vertices that lie within another limb than their own."""
+        points, normals = context.limbs
+        x = context.base + displacement
+        product = jnp.einsum("vib,sib->vsb", x, points)
+        squared = jnp.sum(points**2, axis=1)[None] - 2.0 * product
+        squared = jnp.where(self.others[..., None], squared, jnp.inf)
+        nearest = jnp.argmin(squared, axis=1)
+        lane = jnp.arange(x.shape[2])[None]
+        gap = x - jnp.moveaxis(points[nearest, :, lane], -1, 1)
+        height = jnp.sum(gap * jnp.moveaxis(normals[nearest, :, lane], -1, 1), axis=1)
+        # Only where the sample stands for the skin right above.
+        beside = jnp.sum(gap * gap, axis=1) - height**2
+        inside = (height < 0) & (height > -_DEEP) & (beside < _SAMPLE**2)
+        return jnp.sum(inside & jnp.any(self.others, axis=1)[:, None], axis=0)
 
 
 def _surface(skin: Placed, faces: Array, face: Array, weights: Array) -> tuple[Array, Array]:

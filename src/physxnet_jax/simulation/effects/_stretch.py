@@ -11,7 +11,7 @@ from ...geometry import greedy_colours, mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, Prepared
-from ._coloured import scatter_rows
+from ._coloured import joined, scatter_rows
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,10 +54,10 @@ class Stretch(Effect):
                 _Group(
                     jnp.asarray(a),
                     jnp.asarray(b),
-                    float32(length[members])[:, None, None],
-                    float32(compliance[members])[:, None, None],
-                    float32(w[a])[:, None, None],
-                    float32(w[b])[:, None, None],
+                    float32(length[members][:, None, None]),
+                    float32(compliance[members][:, None, None]),
+                    float32(w[a][:, None, None]),
+                    float32(w[b][:, None, None]),
                 )
             )
         return _Stretch(tuple(groups), 1.0 / self.compression)
@@ -107,43 +107,34 @@ class _Stretch(Prepared):
         return d
 
     def energy(self, displacement: Array, context: tuple[Array, ...]) -> Array:
-        total = jnp.zeros(displacement.shape[2:], displacement.dtype)
-        for g, edge in zip(self.groups, context, strict=True):
-            span = edge + (displacement[g.b] - displacement[g.a])
-            excess = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18) - g.length
-            alpha = g.compliance * jnp.where(excess < 0, self.softer, 1.0)
-            total = total + 0.5 * jnp.sum(excess**2 / alpha, axis=(0, 1))
-        return total
+        g, edge = joined(self.groups), jnp.concatenate(context)
+        span = edge + (displacement[g.b] - displacement[g.a])
+        excess = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18) - g.length
+        alpha = g.compliance * jnp.where(excess < 0, self.softer, 1.0)
+        return 0.5 * jnp.sum(excess**2 / alpha, axis=(0, 1))
 
     def coupled(self) -> Int[np.ndarray, "blocks 2"]:
-        out = []
-        for g in self.groups:
-            a, b = np.asarray(g.a), np.asarray(g.b)
-            out += [np.column_stack(p) for p in ((a, a), (b, b), (a, b), (b, a))]
-        return np.concatenate(out)
+        g = joined(self.groups)
+        a, b = np.asarray(g.a), np.asarray(g.b)
+        return np.concatenate([np.column_stack(p) for p in ((a, a), (b, b), (a, b), (b, a))])
 
     def hessian(self, displacement: Array, context: tuple[Array, ...]) -> Array:
         """Along the edge always, across it only in tension: so it stays positive."""
-        out = []
+        g, edge = joined(self.groups), jnp.concatenate(context)
         eye = jnp.eye(3, dtype=displacement.dtype)[None, None]
-        for g, edge in zip(self.groups, context, strict=True):
-            span = jnp.swapaxes(edge + (displacement[g.b] - displacement[g.a]), 1, 2)
-            length = jnp.sqrt(jnp.sum(span * span, axis=2, keepdims=True) + 1e-18)[..., None]
-            rest = g.length[..., None]
-            k = 1.0 / (g.compliance[..., None] * jnp.where(length < rest, self.softer, 1.0))
-            n = span / length[..., 0]
-            along = n[..., :, None] * n[..., None, :]
-            taut = jnp.maximum(1.0 - rest / length, 0.0)
-            block = k * (along + taut * (eye - along))
-            out += [block, block, -block, -block]
-        return jnp.concatenate(out)
+        span = jnp.swapaxes(edge + (displacement[g.b] - displacement[g.a]), 1, 2)
+        length = jnp.sqrt(jnp.sum(span * span, axis=2, keepdims=True) + 1e-18)[..., None]
+        rest = g.length[..., None]
+        k = 1.0 / (g.compliance[..., None] * jnp.where(length < rest, self.softer, 1.0))
+        n = span / length[..., 0]
+        along = n[..., :, None] * n[..., None, :]
+        taut = jnp.maximum(1.0 - rest / length, 0.0)
+        block = k * (along + taut * (eye - along))
+        return jnp.concatenate([block, block, -block, -block])
 
     def diagnose(self, displacement: Array, context: tuple[Array, ...]) -> dict[str, Array]:
-        strain = []
-        for g, edge in zip(self.groups, context, strict=True):
-            span = edge + (displacement[g.b] - displacement[g.a])
-            length = jnp.sqrt(jnp.sum(span * span, axis=1))
-            rest = jnp.maximum(g.length[:, 0], 1e-4)
-            strain.append((length - g.length[:, 0]) / rest)
-        every = jnp.concatenate(strain)
+        g, edge = joined(self.groups), jnp.concatenate(context)
+        span = edge + (displacement[g.b] - displacement[g.a])
+        length = jnp.sqrt(jnp.sum(span * span, axis=1))
+        every = (length - g.length[:, 0]) / jnp.maximum(g.length[:, 0], 1e-4)
         return {"strain_max": every.max(axis=0), "strain_p99": jnp.quantile(every, 0.99, axis=0)}

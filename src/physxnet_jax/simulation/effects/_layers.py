@@ -1,0 +1,201 @@
+"""Contact between garments worn in layers, in a stated order."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
+
+from ...body import NUM_BODY_VERTICES
+from ...geometry import mesh_edges
+from ...typing import pytree
+from .._assembly import Assembly, float32
+from .._effect import Clock, Effect, Prepared
+from ._limbs import adjoining, limb_labels
+from ._pairs import Pairs, closest_of, foot_of, keep_apart, rows_of, side_normal
+
+# Layers farther apart than this at rest never meet [m].
+_REACH = 0.25
+# A vertex deeper than this under its layer has lost its place there [m].
+_LOST = 0.05
+# Beyond the border of the other garment by more than this there is nothing to touch [m].
+_BESIDE = 0.002
+
+
+@dataclasses.dataclass(frozen=True)
+class LayerContact(Effect):
+    """Each garment of a scene is worn over the ones before it, and stays there.
+
+    Every vertex tracks the closest point of the other garment as `BodyContact` tracks
+    the skin: the search starts where it ended and walks over the surface. The order is
+    known, so a vertex on the wrong side is brought back instead of being kept there.
+    Both ways count: vertices of the outer garment against triangles of the inner one,
+    and vertices of the inner one against triangles of the outer one.
+
+    Attributes:
+        gap: Distance kept between layers [m].
+        friction: Coulomb coefficient between them [1].
+        leave: Layers that overlap are parted at this speed [m/s].
+        hops: Steps of the walk a block.
+        ring: Vertices that a step chooses from.
+        patch: Triangles around the nearest vertex that are compared exactly.
+
+    References:
+        Bridson, Fedkiw and Anderson, Robust treatment of collisions, contact and
+        friction for cloth animation (2002), for vertex against triangle; the order of
+        layers instead of their history is ours.
+    """
+
+    gap: float = 0.003
+    friction: float = 0.3
+    leave: float = 0.2
+    hops: int = 2
+    ring: int = 12
+    patch: int = 10
+
+    def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
+        """Tables of each garment's surface, and where each vertex starts on the others."""
+        x, parts = assembly.rest, assembly.parts
+        label = limb_labels(assembly.weights, assembly.body)
+        ring = np.zeros((len(x), self.ring), np.int32)
+        patch = np.zeros((len(x), self.patch), np.int32)
+        rim = np.zeros(len(x))
+        outwards = np.ones(len(parts) - 1)
+        skin = assembly.rest_body[:NUM_BODY_VERTICES]
+        for g, (i, j) in enumerate(zip(parts, parts[1:])):
+            own = np.flatnonzero(((assembly.faces >= i) & (assembly.faces < j)).all(axis=1))
+            f = assembly.faces[own]
+            ring[i:j] = i + _nearest(x[i:j], x[i:j], self.ring)
+            patch[i:j] = own[_nearest(x[f].mean(axis=1), x[i:j], self.patch)]
+            edges = mesh_edges(f)
+            rim[edges.vertices[edges.count == 1]] = 1.0
+            # Which way a garment's triangles face: away from the skin is outwards.
+            n = np.cross(x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]])
+            middle = x[f].mean(axis=1)
+            away = middle - skin[KDTree(skin).query(middle)[1]]
+            outwards[g] = 1.0 if np.einsum("ij,ij->", n, away) >= 0 else -1.0
+        rows, start, side = [], [], []
+        for a in range(len(parts) - 1):
+            for b in range(len(parts) - 1):
+                if a == b:
+                    continue
+                mine = np.arange(parts[a], parts[a + 1])
+                near = parts[b] + _nearest(x[parts[b] : parts[b + 1]], x[mine], 1)[:, 0]
+                meet = np.linalg.norm(x[near] - x[mine], axis=1) < _REACH
+                mine, near = mine[meet], near[meet]
+                rows.append(mine)
+                start.append(near)
+                side.append(np.full(len(mine), outwards[b] * (1.0 if a > b else -1.0)))
+        if not rows:
+            rows, start, side = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
+        return _Layers(
+            jnp.asarray(np.concatenate(rows).astype(np.int32)),
+            jnp.asarray(np.concatenate(start).astype(np.int32)),
+            float32(np.concatenate(side)[:, None, None]),
+            jnp.asarray(ring),
+            jnp.asarray(patch),
+            jnp.asarray(assembly.faces.astype(np.int32)),
+            float32(rim),
+            jnp.asarray(label.astype(np.int32)),
+            jnp.asarray(adjoining()),
+            jnp.asarray(inverse_mass)[:, None, None],
+            self,
+        )
+
+
+def _nearest(
+    of: Float[np.ndarray, "many 3"], to: Float[np.ndarray, "points 3"], count: int
+) -> Int[np.ndarray, "points count"]:
+    """The nearest of some points; the last repeated where there are too few."""
+    k = min(count, len(of))
+    found = np.reshape(KDTree(of).query(to, k=k)[1], (len(to), k))
+    return np.pad(found, ((0, 0), (0, count - k)), mode="edge")
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class _Layers(Prepared):
+    rows: Int[Array, " pairs"]
+    start: Int[Array, " pairs"]
+    side: Float[Array, "pairs 1 1"]
+    ring: Int[Array, "vertices ring"]
+    patch: Int[Array, "vertices patch"]
+    faces: Int[Array, "faces 3"]
+    rim: Float[Array, " vertices"]
+    label: Int[Array, " vertices"]
+    adjoining: Array
+    inverse_mass: Float[Array, "vertices 1 1"]
+    law: LayerContact = dataclasses.field(metadata={"static": True})
+
+    def initial(self, batch: int) -> Int[Array, "pairs batch"]:
+        return jnp.repeat(self.start[:, None], batch, axis=1)
+
+    def keep(self, context: tuple[Array, Pairs, Clock]) -> Array:
+        return context[0]
+
+    def begin(
+        self, base: Array, start: None, end: None, clock: Clock, memory: Array
+    ) -> tuple[Array, Pairs, Clock]:
+        x = jax.lax.stop_gradient(base)
+        points = x[self.rows]
+        at = memory
+        for _ in range(self.law.hops):
+            ring = self.ring[at]
+            gap = rows_of(x, jnp.moveaxis(ring, 2, 1)) - points[:, None]
+            best = jnp.argmin(jnp.sum(gap * gap, axis=2), axis=1)
+            at = jnp.take_along_axis(ring, best[..., None], axis=2)[..., 0]
+        corners, weights = closest_of(x, points, self.faces[self.patch[at]])
+        foot = foot_of(x, corners, weights)
+        n = self.side * side_normal(x, corners)
+        apart = points - foot
+        height = jnp.sum(apart * n, axis=1, keepdims=True)
+        beside = apart - height * n
+        edge = jnp.sum(weights * (1.0 - self.rim[corners]), axis=0)[:, None] < 1e-3
+        past = edge & (jnp.sum(beside * beside, axis=1, keepdims=True) > _BESIDE**2)
+        close = self.adjoining[self.label[self.rows][:, None], self.label[at]][:, None]
+        active = close & ~past & (height > -_LOST)
+        vertex = jnp.repeat(self.rows[:, None], base.shape[2], axis=1)
+        # Against the true positions, so that the height has a derivative.
+        height = jnp.sum((base[self.rows] - foot_of(base, corners, weights)) * n, axis=1)[:, None]
+        return (
+            at,
+            Pairs(vertex, corners, weights, n, height, active.astype(base.dtype)),
+            clock,
+        )
+
+    def project(
+        self,
+        displacement: Array,
+        start: Array,
+        context: tuple[Array, Pairs, Clock],
+        progress: Array,
+        step: tuple[float, float],
+    ) -> Array:
+        _, pairs, clock = context
+        law = self.law
+        return keep_apart(
+            displacement,
+            start,
+            pairs,
+            self.inverse_mass,
+            law.gap,
+            law.friction,
+            law.leave,
+            clock,
+            progress,
+        )
+
+    def diagnose(self, displacement: Array, context: Any) -> dict[str, Array]:
+        _, pairs, _ = context
+        index = [pairs.vertex, *pairs.corners]
+        share = [jnp.ones_like(pairs.weights[0]), *(-pairs.weights)]
+        gone = sum(s[:, None] * rows_of(displacement, i) for i, s in zip(index, share, strict=True))
+        height = (pairs.height + jnp.sum(gone * pairs.normal, axis=1, keepdims=True))[:, 0]
+        wrong = (height < 0) & (pairs.active[:, 0] > 0)
+        return {
+            "layers_crossed": jnp.sum(wrong, axis=0),
+            "layers_depth": jnp.max(jnp.where(wrong, -height, 0.0), axis=0, initial=0.0),
+        }

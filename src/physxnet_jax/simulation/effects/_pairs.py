@@ -1,0 +1,135 @@
+"""Cloth against cloth: vertices that face triangles, kept apart and rubbing."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ...geometry import closest_barycentric
+from ...typing import pytree
+from .._effect import Clock
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class Pairs:
+    """Vertices, each with the closest point of a triangle: what a block knows of them.
+
+    Attributes:
+        vertex: Rows of the vertices, shape [pairs, batch].
+        corners: Rows of the triangles' corners, shape [3, pairs, batch].
+        weights: Barycentric weights of the closest points, shape [3, pairs, batch].
+        normal: Directions in which the vertices are pushed, shape [pairs, 3, batch].
+        height: Along them, at the block's start [m], shape [pairs, 1, batch].
+        active: 1 where the pair counts, else 0, shape [pairs, 1, batch].
+    """
+
+    vertex: Int[Array, "pairs batch"]
+    corners: Int[Array, "3 pairs batch"]
+    weights: Float[Array, "3 pairs batch"]
+    normal: Float[Array, "pairs 3 batch"]
+    height: Float[Array, "pairs 1 batch"]
+    active: Float[Array, "pairs 1 batch"]
+
+
+def rows_of(x: Float[Array, "vertices 3 batch"], index: Int[Array, "... batch"]) -> Array:
+    """Rows of each batch member, shape [..., 3, batch]."""
+    lane = jnp.arange(x.shape[2]).reshape((1,) * (index.ndim - 1) + (-1,))
+    out = x[index, :, lane]
+    return jnp.moveaxis(out, -1, -2)
+
+
+def closest_of(
+    x: Float[Array, "vertices 3 batch"],
+    points: Float[Array, "pairs 3 batch"],
+    patch: Int[Array, "pairs batch k 3"],
+) -> tuple[Array, Array]:
+    """The closest of k triangles for each point: corners and weights, [3, pairs, batch]."""
+    batch = x.shape[2]
+    # [3, k, pairs, batch], flat so that every gather is one of single numbers.
+    corner = jnp.moveaxis(patch, (3, 2), (0, 1))
+    flat = [x[:, i].reshape(-1) for i in range(3)]
+    at = corner * batch + jnp.arange(batch)[None, None, None]
+    tri = [jnp.stack([f[at[k]] for f in flat]) for k in range(3)]
+    p = jnp.broadcast_to(jnp.moveaxis(points, 1, 0)[:, None], tri[0].shape)
+    weights, squared = closest_barycentric(p, *tri)
+    best = jnp.argmin(squared, axis=0)[None, None]
+    corner = jnp.take_along_axis(corner, best, axis=1)[:, 0]
+    return corner, jnp.take_along_axis(weights, best, axis=1)[:, 0]
+
+
+def foot_of(x: Float[Array, "vertices 3 batch"], corners: Array, weights: Array) -> Array:
+    """Points on triangles, shape [pairs, 3, batch]."""
+    return sum(w[:, None] * rows_of(x, c) for w, c in zip(weights, corners, strict=True))  # pyright: ignore[reportReturnType]
+
+
+def keep_apart(
+    displacement: Float[Array, "vertices 3 batch"],
+    start: Float[Array, "vertices 3 batch"],
+    pairs: Pairs,
+    inverse_mass: Float[Array, "vertices 1 1"],
+    gap: float,
+    friction: float,
+    leave: float,
+    clock: Clock,
+    progress: Array,
+) -> Array:
+    """Displacements [m] after vertices and triangles have been pushed apart.
+
+    What was too close when the block began is parted no faster than ``leave`` [m/s],
+    so that tangled cloth comes apart instead of bursting. All pairs act at once, and
+    each vertex takes the mean of what they ask of it: order plays no part.
+
+    Args:
+        displacement: Since the block's start [m].
+        start: At the substep's start [m].
+        pairs: The pairs of this block.
+        inverse_mass: [1/kg].
+        gap: Distance kept [m].
+        friction: Coulomb coefficient between the layers [1].
+        leave: Speed of recovery [m/s].
+        clock: The block.
+        progress: Share of the block done.
+    """
+    lane = jnp.arange(displacement.shape[2])[None]
+    index = [pairs.vertex, *pairs.corners]
+    share = [jnp.ones_like(pairs.weights[0]), *(-pairs.weights)]
+    rows = [rows_of(displacement, i) for i in index]
+    mass = [inverse_mass[i, 0, 0][:, None] for i in index]
+
+    def between(r: list[Array]) -> Array:
+        return sum(s[:, None] * x for s, x in zip(share, r, strict=True))  # pyright: ignore[reportReturnType]
+
+    n = pairs.normal
+    gone = between(rows)
+    height = pairs.height + jnp.sum(gone * n, axis=1, keepdims=True)
+    wanted = jnp.minimum(gap, pairs.height + leave * progress * clock.length)
+    depth = jnp.maximum(wanted - height, 0.0) * pairs.active
+    inertia = sum(s[:, None] ** 2 * w for s, w in zip(share, mass, strict=True))
+    lift = depth / (inertia + 1e-9)
+    slide = gone - between([rows_of(start, i) for i in index])
+    slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
+    length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
+    hold = jnp.minimum(1.0, friction * depth / length) / (inertia + 1e-9)
+    move = lift * n - jnp.where(depth > 0, hold, 0.0) * slide
+    total = jnp.zeros_like(displacement)
+    count = jnp.zeros_like(displacement[:, :1])
+    acts = (depth > 0).astype(displacement.dtype)
+    for i, s, w in zip(index, share, mass, strict=True):
+        part = jnp.moveaxis(s[:, None] * w * move, 1, 2)
+        total = total.at[i, :, lane].add(part)
+        count = count.at[i, 0, lane].add((jnp.abs(s)[:, None] * acts)[:, 0])
+    return displacement + total / jnp.maximum(count, 1.0)
+
+
+def side_normal(x: Float[Array, "vertices 3 batch"], corners: Int[Array, "3 pairs batch"]) -> Array:
+    """Unit normals of triangles, shape [pairs, 3, batch]; zero without area."""
+    a, b, c = (rows_of(x, i) for i in corners)
+    n = jnp.cross(b - a, c - a, axis=1)
+    return n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-20)
+
+
+def frozen(pairs: Pairs) -> Pairs:
+    """Pairs as constants: who faces whom has no derivative."""
+    return jax.tree.map(jax.lax.stop_gradient, pairs)

@@ -1,0 +1,55 @@
+"""Seams: pairs of vertices sewn together."""
+
+import dataclasses
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ...errors import SimulationError
+from ...typing import pytree
+from .._assembly import Assembly
+from .._effect import Effect, Prepared
+from ._coloured import Coloured, Constraint, Group, colour_groups
+
+
+@dataclasses.dataclass(frozen=True)
+class Seam(Effect):
+    """``E = 1/2 k |x_a - x_b|^2`` for each stitch, k stiff: panels are drawn together.
+
+    Attributes:
+        stitches: Pairs of vertices of the scene, garments counted one after another.
+        stiffness: Of one stitch [N/m].
+
+    References:
+        Baraff and Witkin, Large steps in cloth simulation (1998), for seams as springs.
+    """
+
+    stitches: tuple[tuple[int, int], ...] = ()
+    stiffness: float = 1e4
+
+    def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
+        """Colours the stitches so that a Gauss-Seidel sweep runs group by group."""
+        pairs = np.asarray(self.stitches, np.int64).reshape(-1, 2)
+        if pairs.size and not (0 <= pairs.min() and pairs.max() < len(assembly.rest)):
+            raise SimulationError(
+                f"A stitch names vertex {int(pairs.max())}; the scene has {len(assembly.rest)}."
+            )
+        law = {"compliance": np.full(len(pairs), 1.0 / self.stiffness)}
+        return _Seam(colour_groups(pairs, np.asarray(inverse_mass), law))
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class _Seam(Coloured):
+    groups: tuple[Group, ...]
+
+    def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
+        def open_by(x: tuple[Array, ...]) -> Constraint:
+            span = x[1] - x[0]
+            length = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18)
+            n = span / length
+            return Constraint(length, (-n, n), law["compliance"])
+
+        return [open_by]

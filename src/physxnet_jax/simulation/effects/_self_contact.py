@@ -1,0 +1,204 @@
+"""Contact of a garment with itself."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ...geometry import connected_components, mesh_edges, vertex_faces
+from ...typing import pytree
+from .._assembly import Assembly
+from .._effect import Clock, Effect, Prepared
+from ._pairs import Pairs, closest_of, foot_of, keep_apart, rows_of, side_normal
+
+
+@dataclasses.dataclass(frozen=True)
+class SelfContact(Effect):
+    """A garment's folds stay apart, each on the side on which a block found it.
+
+    Every few blocks a grid of cells finds for each vertex the nearest vertex in front of
+    the cloth and the nearest behind it, neighbours left out (vertices of one piece that
+    are close at rest and face the same way). In each block the closest of the triangles
+    around them makes a pair, kept apart by the gap in the direction in which it was.
+    Edges that cross between vertices aren't seen: folds sharper than a triangle may cut
+    each other.
+
+    Attributes:
+        gap: Distance kept [m].
+        friction: Coulomb coefficient of cloth on itself [1].
+        leave: Folds that are too close are parted at this speed [m/s].
+        reach: Pairs nearer than this are watched [m]. The median edge at rest and the
+            gap if None; folds whose edges are twice as long leave gaps.
+        every: Blocks from one search of the grid to the next.
+        room: Vertices that a cell of the grid holds; more set the overflow bit.
+
+    References:
+        Bridson, Fedkiw and Anderson, Robust treatment of collisions, contact and
+        friction for cloth animation (2002); Teschner et al., Optimized spatial hashing
+        for collision detection of deformable objects (2003).
+    """
+
+    gap: float = 0.002
+    friction: float = 0.3
+    leave: float = 0.2
+    reach: float | None = None
+    every: int = 4
+    room: int = 24
+
+    def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
+        """Tables of triangles and of who counts as a neighbour."""
+        x, f = assembly.rest, assembly.faces
+        ends = mesh_edges(f).vertices
+        length = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1)
+        usual, most = np.quantile(length, [0.5, 0.95]) if len(length) else (0.0, 0.0)
+        reach = usual + self.gap if self.reach is None else self.reach
+        part = np.searchsorted(np.asarray(assembly.parts), np.arange(len(x)), side="right")
+        n = np.zeros_like(x)
+        for k in range(3):
+            np.add.at(n, f[:, k], np.cross(x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]]))
+        return _Self(
+            jnp.asarray(x.astype(np.float32)),
+            jnp.asarray(n.astype(np.float32)),
+            jnp.asarray(connected_components(f, len(x))),
+            jnp.asarray(part.astype(np.int32)),
+            jnp.asarray(f.astype(np.int32)[vertex_faces(f, len(x))]),
+            jnp.asarray(f.astype(np.int32)),
+            jnp.asarray(inverse_mass)[:, None, None],
+            self,
+            float(reach),
+            float(2.5 * max(most, self.gap)),
+        )
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class _Self(Prepared):
+    rest: Float[Array, "vertices 3"]
+    facing: Float[Array, "vertices 3"]
+    piece: Int[Array, " vertices"]
+    part: Int[Array, " vertices"]
+    around: Int[Array, "vertices degree 3"]
+    faces: Int[Array, "faces 3"]
+    inverse_mass: Float[Array, "vertices 1 1"]
+    law: SelfContact = dataclasses.field(metadata={"static": True})
+    reach: float = dataclasses.field(metadata={"static": True})
+    apart: float = dataclasses.field(metadata={"static": True})
+
+    def initial(self, batch: int) -> tuple[Array, Array, Array]:
+        count = self.rest.shape[0]
+        none = jnp.full((2, count, batch), -1, jnp.int32)
+        return jnp.zeros((), jnp.int32), none, jnp.zeros(batch, jnp.int32)
+
+    def keep(self, context: tuple[Pairs, Clock, tuple]) -> tuple[Array, Array, Array]:
+        blocks, near, crowd = context[2]
+        return (blocks + 1) % self.law.every, near, crowd
+
+    def begin(
+        self, base: Array, start: None, end: None, clock: Clock, memory: tuple
+    ) -> tuple[Pairs, Clock, tuple]:
+        x = jax.lax.stop_gradient(base)
+        batch = base.shape[2]
+        search = jax.vmap(self.nearest, in_axes=2, out_axes=(2, 0))
+        near, crowd = jax.lax.cond(
+            memory[0] == 0, lambda: search(x), lambda: (memory[1], memory[2])
+        )
+        found_now = memory[0], near, crowd
+        # [2 vertices, batch]: in front of the cloth, then behind it.
+        near = near.reshape(-1, batch)
+        own = jnp.arange(base.shape[0], dtype=near.dtype)
+        vertex = jnp.repeat(jnp.concatenate([own, own])[:, None], batch, axis=1)
+        found = (near >= 0)[:, None]
+        corners, weights = closest_of(x, jnp.concatenate([x, x]), self.around[jnp.maximum(near, 0)])
+        gone = jnp.concatenate([x, x]) - foot_of(x, corners, weights)
+        length = jnp.sqrt(jnp.sum(gone * gone, axis=1, keepdims=True) + 1e-18)
+        # On top of each other there is no direction but the triangle's own.
+        n = jnp.where(length > 1e-6, gone / length, side_normal(x, corners))
+        both = jnp.concatenate([base, base])
+        height = jnp.sum((both - foot_of(base, corners, weights)) * n, axis=1, keepdims=True)
+        active = (found & (length < self.reach)).astype(base.dtype)
+        return Pairs(vertex, corners, weights, n, height, active), clock, found_now
+
+    def nearest(self, x: Float[Array, "vertices 3"]) -> tuple[Int[Array, "2 vertices"], Array]:
+        """The nearest vertex on either side of the cloth, -1 for none, and the overflow."""
+        law, count = self.law, x.shape[0]
+        # A sphere of this radius touches at most the eight cells around a corner.
+        cell = 2.0 * self.reach
+        size = 1 << int(np.ceil(np.log2(2 * count + 1)))
+        safe = jnp.where(jnp.isfinite(x), x, 0.0) / cell
+
+        def key(place: Int[Array, "... 3"]) -> Int[Array, "..."]:
+            a, b, c = (place[..., i] for i in range(3))
+            mixed = (a * 73856093) ^ (b * 19349663) ^ (c * 83492791)
+            return mixed & (size - 1)
+
+        home = jnp.floor(safe).astype(jnp.int32)
+        slot = key(home)
+        order = jnp.argsort(slot)
+        held = jnp.zeros(size, jnp.int32).at[slot].add(1)
+        begins = jnp.cumsum(held) - held
+        # The half of its cell in which a vertex lies says which neighbours count.
+        first = jnp.floor(safe - 0.5).astype(jnp.int32)
+        corner = jnp.asarray([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], jnp.int32)
+        cells = key(first[:, None] + corner[None])
+        lane = jnp.arange(law.room, dtype=jnp.int32)[None, None]
+        place = begins[cells][..., None] + lane
+        other = order[jnp.minimum(place, count - 1)].astype(jnp.int32)
+        ok = lane < held[cells][..., None]
+        other, ok = other.reshape(count, -1), ok.reshape(count, -1)
+        gap = x[other] - x[:, None]
+        squared = jnp.sum(gap * gap, axis=2)
+        rest = self.rest[other] - self.rest[:, None]
+        facing = jnp.sum(self.facing[other] * self.facing[:, None], axis=2) > 0
+        beside = facing & (self.piece[other] == self.piece[:, None])
+        ok &= ~beside | (jnp.sum(rest * rest, axis=2) > self.apart**2)
+        ok &= other != jnp.arange(count)[:, None]
+        ok &= self.part[other] == self.part[:, None]
+        ok &= squared < (2.0 * cell) ** 2
+        normal = self.normals(x)
+        front = jnp.sum(gap * normal[:, None], axis=2) >= 0
+        out = []
+        for side in (front, ~front):
+            measure = jnp.where(ok & side, squared, jnp.inf)
+            best = jnp.argmin(measure, axis=1)[:, None]
+            there = jnp.isfinite(jnp.take_along_axis(measure, best, axis=1))[:, 0]
+            out.append(jnp.where(there, jnp.take_along_axis(other, best, axis=1)[:, 0], -1))
+        return jnp.stack(out), jnp.sum(jnp.maximum(held - law.room, 0))
+
+    def normals(self, x: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
+        """Area-weighted vertex normals, not unit."""
+        a, b, c = (x[self.faces[:, i]] for i in range(3))
+        n = jnp.cross(b - a, c - a)
+        return jnp.zeros_like(x).at[self.faces.reshape(-1)].add(jnp.repeat(n, 3, axis=0))
+
+    def project(
+        self,
+        displacement: Array,
+        start: Array,
+        context: tuple[Pairs, Clock, tuple],
+        progress: Array,
+        step: tuple[float, float],
+    ) -> Array:
+        pairs, clock, _ = context
+        law = self.law
+        return keep_apart(
+            displacement,
+            start,
+            pairs,
+            self.inverse_mass,
+            law.gap,
+            law.friction,
+            law.leave,
+            clock,
+            progress,
+        )
+
+    def diagnose(self, displacement: Array, context: tuple[Pairs, Clock, tuple]) -> dict:
+        pairs, _, crowd = context
+        index = [pairs.vertex, *pairs.corners]
+        share = [jnp.ones_like(pairs.weights[0]), *(-pairs.weights)]
+        gone = sum(s[:, None] * rows_of(displacement, i) for i, s in zip(index, share, strict=True))
+        height = pairs.height + jnp.sum(gone * pairs.normal, axis=1, keepdims=True)
+        gap = jnp.where(pairs.active > 0, height, jnp.inf)
+        return {"self_gap": gap.min(axis=(0, 1)), "overflow": crowd[2]}

@@ -1,0 +1,143 @@
+"""Cloth on cloth: itself, layers in a stated order, seams."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.errors import SimulationError
+from physxnet_jax.garment import free_garment, square_sheet, template
+from physxnet_jax.motion import load_motion
+from physxnet_jax.simulation import (
+    STANDARD,
+    XPBD,
+    Bend,
+    Clock,
+    Gravity,
+    LayerContact,
+    Pin,
+    Scene,
+    Seam,
+    SelfContact,
+    Status,
+    Stretch,
+    prepare_scene,
+    simulate,
+    simulate_still,
+)
+
+STEPS = XPBD(32, 4)
+
+
+def two_sheets(n=8, size=0.3):
+    """One garment of two level sheets: the lower is held, the upper falls on it."""
+    low, high = square_sheet(n, size), square_sheet(n, size / 2, corner=(0.08, 0.03, 1.58))
+    v = np.concatenate([np.asarray(g.mesh.vertices) for g in (low, high)])
+    f = np.concatenate([np.asarray(low.mesh.faces), np.asarray(high.mesh.faces) + n * n])
+    return free_garment(v, f, pinned=np.arange(n * n)), n * n
+
+
+def test_a_sheet_lands_on_another_of_the_same_garment():
+    g, first = two_sheets()
+    effects = (Gravity(), Stretch(), SelfContact(gap=0.004), Pin())
+    out = simulate_still(prepare_scene(Scene((g,), effects)), 20, solver=STEPS)
+    above = out.positions[0][:, first:, 1]
+    assert above[-1].min() > 0.003
+    assert above.min() > 0.0, "never below, on the way either"
+    assert np.abs(np.diff(above[-3:], axis=0)).max() < 2e-3, "it lies still"
+    # It stops where it lands; without self-contact it falls through.
+    none = tuple(e for e in effects if not isinstance(e, SelfContact))
+    free = simulate_still(prepare_scene(Scene((g,), none)), 20, solver=STEPS)
+    assert free.positions[0][-1, first:, 1].max() < -0.5
+
+
+def test_the_grid_finds_the_nearest_on_either_side():
+    """Against all pairs, for a crumpled cloud; a cell that is too small says so."""
+    rng = np.random.default_rng(0)
+    g = square_sheet(12, 0.5)
+    e = prepare_scene(Scene((g,), (SelfContact(),))).effects[0]
+    x = rng.uniform(0, 0.25, (144, 3)).astype(np.float32) - 0.1
+    near, crowd = e.nearest(jnp.asarray(x))
+    assert int(crowd) == 0
+    gap = x[None] - x[:, None]
+    distance = np.linalg.norm(gap, axis=2)
+    rest = np.asarray(e.rest)
+    # A level sheet: all of it is one piece and faces one way.
+    distance[np.linalg.norm(rest[None] - rest[:, None], axis=2) <= e.apart] = np.inf
+    front = np.einsum("abi,ai->ab", gap, np.asarray(e.normals(jnp.asarray(x)))) >= 0
+    for side, found in zip((front, ~front), np.asarray(near), strict=True):
+        d = np.where(side, distance, np.inf)
+        best, least = d.argmin(axis=1), d.min(axis=1)
+        close = least < e.reach
+        assert close.sum() > 30
+        assert (found[close] == best[close]).all()
+    tiny = dataclasses.replace(e, law=dataclasses.replace(e.law, room=1))
+    assert int(tiny.nearest(jnp.asarray(x))[1]) > 0
+
+
+def test_self_contact_that_touches_nothing_changes_no_bit():
+    g = square_sheet(6)
+    plain = (Gravity(), Stretch(), Pin())
+    runs = [
+        simulate_still(prepare_scene(Scene((g,), e)), 5, solver=STEPS).positions[0]
+        for e in (plain, (*plain[:2], SelfContact(), Pin()))
+    ]
+    np.testing.assert_array_equal(*runs)
+
+
+@pytest.mark.parametrize("start", [0.03, -0.01], ids=["outside", "inside"])
+def test_layers_keep_their_order_or_get_it_back(start):
+    """Upright sheets before the body; the outer one is thrown at the inner one, or
+    begins behind it, and ends before it."""
+    inner = square_sheet(10, 0.3, upright=True, pinned=np.arange(100))
+    outer = square_sheet(7, 0.18, upright=True, corner=(0.06, -0.06, 1.5 + start))
+    effects = (Stretch(), Bend(), LayerContact(), Pin())
+    scene = prepare_scene(Scene((inner, outer), effects))
+    v = np.zeros((149, 3))
+    v[100:, 2] = -1.0 if start > 0 else 0.0
+    out = simulate_still(scene, 12, solver=STEPS, velocity=v)
+    front = out.positions[1][-1][:, 2] - 1.5
+    assert front.min() > 0.002
+    assert (out.diagnostics["layers_crossed"][-1] == 0).all()
+    if start > 0:
+        free = prepare_scene(Scene((inner, outer), (Stretch(), Pin())))
+        through = simulate_still(free, 12, solver=STEPS, velocity=v)
+        assert through.positions[1][-1][:, 2].max() < 1.4
+    else:
+        assert out.status[0] & Status.CROSSED, "said while it lasts"
+        assert out.diagnostics["speed_max"].max() < 0.5, "no burst"
+
+
+def test_a_top_stays_outside_the_trousers():
+    motion = load_motion("walk", fps=30.0)
+    motion = dataclasses.replace(motion, rotations=motion.rotations[:10], root=motion.root[:10])
+    effects = (*STANDARD[:4], LayerContact(), *STANDARD[4:])
+    out = simulate(Scene((template("bottom"), template("top")), effects), motion)
+    assert out.diagnostics["layers_crossed"].max() <= 3
+    assert out.diagnostics["layers_depth"].max() < 0.004
+    assert out.diagnostics["penetration_max"].max() < 0.003
+
+
+def test_seams_draw_panels_together():
+    left = square_sheet(6, 0.2, upright=True, pinned=np.arange(0, 36, 6))
+    right = square_sheet(6, 0.2, upright=True, corner=(0.24, 0.0, 1.5))
+    edge = tuple((6 * i + 5, 36 + 6 * i) for i in range(6))
+    scene = prepare_scene(Scene((left, right), (Stretch(), Seam(edge), Pin())))
+    out = simulate_still(scene, 45, solver=STEPS)
+    a, b = (np.asarray(edge)[:, k] for k in range(2))
+    gap = np.linalg.norm(out.positions[0][-1][a] - out.positions[1][-1][b - 36], axis=1)
+    assert gap.max() < 2e-3
+    with pytest.raises(SimulationError, match="names vertex 99"):
+        prepare_scene(Scene((left, right), (Seam(((0, 99),)),)))
+
+
+def test_contact_of_cloth_needs_no_clock():
+    """The gap a pair keeps doesn't depend on where in time the block lies."""
+    g, _ = two_sheets()
+    e = prepare_scene(Scene((g,), (SelfContact(),))).effects[0]
+    x = e.rest[:, :, None]
+    pairs = [
+        e.begin(x, None, None, Clock(jnp.float32(t), 0.01), e.initial(1))[0] for t in (0.0, 5.0)
+    ]
+    np.testing.assert_array_equal(pairs[0].height, pairs[1].height)
