@@ -96,3 +96,72 @@ class Stress:
     """Print nothing but errors."""
     debug: bool = False
     """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulate:
+    """Simulate a scene: a motion with garments, or a scene file (TOML).
+
+    Stopped, the same command goes on where it was.
+
+    Examples:
+      physxnet simulate walk --wear bottom top -o walk.usdc
+      physxnet simulate punch --wear top --fabric silk --wind 0 0 4 --preview punch.mp4
+      physxnet simulate scene.toml -o scene.npz
+    """
+
+    scene: tyro.conf.Positional[str]
+    """A scene file (.toml), a motion file, or a built-in clip."""
+    wear: tuple[str, ...] = ("top", "bottom")
+    """Templates (top, bottom, dress) and OBJ files; not with a scene file."""
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Result: .usdc, .usd, .usda, .pc2 (with OBJ) or .npz."""
+    preview: pathlib.Path | None = None
+    """Picture or video: .png, .gif or .mp4."""
+    accuracy: Literal["draft", "standard", "fine"] | None = None
+    """What it may cost; standard, or what the scene file says."""
+    fabric: str | None = None
+    """cotton, denim, silk, wool, jersey or leather for all garments."""
+    wind: tuple[float, float, float] | None = None
+    """Steady wind [m/s]."""
+    self_contact: bool = False
+    """Garments collide with themselves."""
+    fps: float = 30.0
+    """Frames a second."""
+    frames: int | None = None
+    """Stop after this many frames."""
+    engine: Literal["xpbd", "bdf2", "blender"] = "xpbd"
+    """bdf2: implicit, second order. blender: out of process (see PHYSXNET_BLENDER)."""
+    body: bool = True
+    """Put the body into the result."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Effects:
+    """What a scene's effects cost and change: each is removed in turn and measured.
+
+    Examples:
+      physxnet effects walk --wear top --frames 20
+      physxnet effects scene.toml --recommend --json effects.json
+    """
+
+    scene: tyro.conf.Positional[str]
+    """A scene file (.toml), a motion file, or a built-in clip."""
+    wear: tuple[str, ...] = ("top", "bottom")
+    """Templates (top, bottom, dress) and OBJ files; not with a scene file."""
+    frames: int | None = 20
+    """Frames that are simulated."""
+    recommend: bool = False
+    """Say which effects matter, those that the scene doesn't have included."""
+    tolerance: float = 2.0
+    """Differences below this don't matter [mm]."""
+    json: pathlib.Path | None = None
+    """Write the rows to this file."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""

@@ -7,17 +7,19 @@ from typing import Annotated
 
 import tyro
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from ..errors import BrokenInstallError, PhysXNetError
-from ._commands import Clips, Demo, Doctor, Dress, Stress
+from ._commands import Clips, Demo, Doctor, Dress, Effects, Simulate, Stress
 from ._doctor import doctor
+from ._progress import progress_bars
 
 _Command = (
     Annotated[Dress, tyro.conf.subcommand("dress")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     | Annotated[Clips, tyro.conf.subcommand("clips")]
+    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
+    | Annotated[Effects, tyro.conf.subcommand("effects")]
     | Annotated[Stress, tyro.conf.subcommand("stress")]
 )
 
@@ -51,11 +53,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Console(stderr=True, soft_wrap=True).print(f"physxnet: {error}", style="red", markup=False)
         return 2
     except KeyboardInterrupt:
-        Console(stderr=True).print("physxnet: stopped; nothing half-written is left.")
+        left = "what is done is kept for the next run" if isinstance(command, Simulate) else ""
+        Console(stderr=True).print(f"physxnet: stopped; {left or 'nothing half-written is left'}.")
         return 130
 
 
-def _run(command: Dress | Demo | Doctor | Clips | Stress, console: Console) -> int:
+def _run(
+    command: Dress | Demo | Doctor | Clips | Simulate | Effects | Stress, console: Console
+) -> int:
+    if isinstance(command, Simulate | Effects):
+        from ._simulate import price, simulate
+
+        quiet = Console(quiet=True) if command.quiet else console
+        if isinstance(command, Simulate):
+            return simulate(command, quiet)
+        return price(command, quiet)
     if isinstance(command, Stress):
         from ._stress import stress
 
@@ -95,22 +107,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     shape = load_body().shape(**_parse_shape(command.shape)) if command.shape else None
     if command.quiet:
         console = Console(quiet=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed}/{task.total}"),
-        TimeRemainingColumn(),
-    )
-    with Progress(
-        *columns, console=console, transient=True, disable=not console.is_terminal
-    ) as bar:
-        tasks: dict[str, int] = {}
-
-        def progress(name: str, done: int, total: int) -> None:
-            if name not in tasks:
-                tasks[name] = bar.add_task(name, total=total)
-            bar.update(tasks[name], completed=done)  # pyright: ignore[reportArgumentType]
-
+    with progress_bars(console) as progress:
         motion = load_motion(
             command.motion,
             fps=command.fps,

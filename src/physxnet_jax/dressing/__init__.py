@@ -9,12 +9,18 @@ from ._dress import (
     fit_surface as fit_surface,
     unbound_wearable as unbound_wearable,
 )
+from ._meshes import animated_meshes as animated_meshes
 from ._push_out import (
     SkinPatch as SkinPatch,
     make_patch as make_patch,
     push_out as push_out,
     skin_height as skin_height,
     tuck_in as tuck_in,
+)
+from ._scene_file import (
+    SceneFile as SceneFile,
+    load_scene as load_scene,
+    make_scene as make_scene,
 )
 from ._skirt import SkirtPatch as SkirtPatch
 from ._stages import Stage as Stage

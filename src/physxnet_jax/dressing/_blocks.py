@@ -14,7 +14,7 @@ from ..body import Body
 from ..garment import Garment
 from ..models import WINDOW, Predictor, Wearable, dress_frames, skin_wearable
 from ..motion import BLOCK, Motion, padded_block
-from ..simulation import Scene, prepare_scene, simulate_batch
+from ..simulation import Scene, prepare_scene, simulate_batch, standard_effects
 from ._push_out import SkinPatch, push_out, skin_height
 from ._stages import Stage
 
@@ -101,13 +101,19 @@ def simulate_clip(
         if progress is not None:
             progress("simulation", done, total)
 
-    scene = prepare_scene(Scene(tuple(garments), body=body, shape=shape))
-    rollout = simulate_batch(scene, [clip], progress=tick)[0]
+    order = inside_out(garments)
+    scene = Scene(tuple(order), standard_effects(len(order)), body, shape)
+    rollout = simulate_batch(prepare_scene(scene), [clip], progress=tick)[0]
     rollout.check()
     laps = 1e3 * np.diff(ticks)
     warm = float(np.median(laps[1:])) / 10 if len(laps) > 1 else None
     stages.append(Stage("simulation", float(laps[0]), warm))
-    return dict(zip([g.name for g in garments], rollout.positions, strict=True))
+    return dict(zip([g.name for g in order], rollout.positions, strict=True))
+
+
+def inside_out(garments: Sequence[Garment]) -> list[Garment]:
+    """Garments in the order of layers: trousers, dresses, tops; else as they come."""
+    return sorted(garments, key=lambda g: ("bottom", "dress", "top").index(g.template))
 
 
 def inside_share(

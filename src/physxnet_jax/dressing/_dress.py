@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import Body, load_body
@@ -16,7 +15,6 @@ from ..io import DEFAULT, AnimatedMesh, load_garment, load_predictor
 from ..models import Predictor, Wearable, make_surface, make_wearable
 from ..motion import (
     Motion,
-    body_animation,
     clip_transforms,
     load_motion,
     resample,
@@ -24,13 +22,12 @@ from ..motion import (
 )
 from ..uv import Binding, Transference, bind
 from ._blocks import inside_share, predict_clip, simulate_clip
+from ._meshes import animated_meshes, with_names
 from ._push_out import make_patch, tuck_in
 from ._stages import Stage, Watch
 
 Method = Literal["network", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "lbs", "simulate")
-_COLOURS = ((0.16, 0.27, 0.55), (0.55, 0.28, 0.20), (0.25, 0.45, 0.30), (0.45, 0.25, 0.45))
-_SKIN_COLOUR = (0.69, 0.46, 0.33)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -132,7 +129,7 @@ def dress(
             clip = Motion(clip.rotations[:frames], clip.root[:frames], clip.fps, clip.name)
         world, shift = clip_transforms(body, rest, clip)
     with watch("garments"):
-        garments = _named(
+        garments = with_names(
             [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
         )
     hits: dict[str, float | None] = {g.name: None for g in garments}
@@ -164,36 +161,10 @@ def dress(
         w.name: inside_share(p, positions[w.name], world, shift)
         for w, p in zip(wearables, patches, strict=True)
     }
-    meshes = []
-    if include_body:
-        with watch("body"):
-            skin = np.asarray(body_animation(body, clip, shape))
-        mesh = body.rest_mesh()
-        meshes.append(
-            AnimatedMesh(
-                "body",
-                skin,
-                np.asarray(mesh.faces),
-                np.asarray(mesh.uv),
-                np.asarray(mesh.uv_faces),
-                _SKIN_COLOUR,
-            )
-        )
-    for k, g in enumerate(garments):
-        uv = None if g.mesh.uv is None else np.asarray(g.mesh.uv)
-        uv_faces = None if g.mesh.uv_faces is None else np.asarray(g.mesh.uv_faces)
-        meshes.append(
-            AnimatedMesh(
-                g.name,
-                positions[g.name],
-                np.asarray(g.mesh.faces),
-                uv,
-                uv_faces,
-                _COLOURS[k % len(_COLOURS)],
-            )
-        )
+    with watch("body"):
+        meshes = animated_meshes(body, clip, shape, garments, positions, include_body)
     return DressedClip(
-        tuple(meshes),
+        meshes,
         clip.fps,
         tuple(stages),
         hits,
@@ -241,18 +212,3 @@ def unbound_wearable(body: Body, rest: Float[Array, "all 3"], garment: Garment) 
         garment.template,
         garment.name,
     )
-
-
-def _named(garments: list[Garment]) -> list[Garment]:
-    """Garments with names that differ."""
-    taken = {"body"}
-    out = []
-    for g in garments:
-        name, count = g.name, 2
-        while name in taken:
-            name, count = f"{g.name}_{count}", count + 1
-        taken.add(name)
-        out.append(dataclasses.replace(g, name=name))
-    if not out:
-        raise PhysXNetError("Nothing to wear: name at least one garment.")
-    return out

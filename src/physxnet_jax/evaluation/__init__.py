@@ -1,4 +1,12 @@
 """Metrics and reports: what an answer is worth, and what holds where it is hard."""
 
 from ._metrics import VertexError as VertexError, vertex_error as vertex_error
+from ._penetration import Penetration as Penetration, penetration as penetration
+from ._price import (
+    Advice as Advice,
+    Price as Price,
+    price_effects as price_effects,
+    recommend_effects as recommend_effects,
+)
+from ._strain import edge_strain as edge_strain
 from ._stress import CASES as CASES, Finding as Finding, run_case as run_case

@@ -1,6 +1,7 @@
 """The cloth simulator: scenes of effects, solvers, rollouts. Knows nothing of UV maps."""
 
 from ._advance import advance as advance
+from ._assembly import Assembly as Assembly
 from ._diagnostics import Rollout as Rollout, Status as Status
 from ._effect import Clock as Clock, Effect as Effect, Prepared as Prepared
 from ._implicit import Implicit as Implicit
@@ -11,10 +12,12 @@ from ._rollout import (
     simulate_batch as simulate_batch,
 )
 from ._scene import (
+    EFFECTS as EFFECTS,
     STANDARD as STANDARD,
     PreparedScene as PreparedScene,
     Scene as Scene,
     prepare_scene as prepare_scene,
+    standard_effects as standard_effects,
 )
 from ._solver import Solver as Solver
 from ._state import State as State, System as System

@@ -1,6 +1,7 @@
 """Rollouts: a scene through a motion, from rest, frame by frame."""
 
 import dataclasses
+import pathlib
 from collections.abc import Callable
 
 import jax
@@ -14,6 +15,7 @@ from ..motion import Motion, animate
 from ._advance import advance
 from ._assembly import float32
 from ._diagnostics import Rollout
+from ._resume import Resume, fingerprint
 from ._scene import PreparedScene, Scene, prepare_scene
 from ._solver import Solver
 from ._state import State
@@ -73,6 +75,7 @@ def simulate(
     progress: Callable[[int, int], None] | None = None,
     energies: bool = False,
     throw: bool = True,
+    resume: str | pathlib.Path | None = None,
 ) -> Rollout:
     """Simulates a scene through a motion.
 
@@ -84,6 +87,7 @@ def simulate(
         progress: Called with frames done and frames in all.
         energies: Put the energy of each effect into the diagnostics.
         throw: Raise if a frame isn't finite; otherwise the status tells.
+        resume: Folder in which blocks are kept until all are done, see `simulate_batch`.
 
     Returns:
         Positions of each garment in every frame, and diagnostics. The lead-in from
@@ -101,6 +105,7 @@ def simulate(
         solver=ACCURACY[accuracy] if solver is None else solver,
         progress=progress,
         energies=energies,
+        resume=resume,
     )[0]
     if throw:
         out.check()
@@ -114,6 +119,7 @@ def simulate_batch(
     solver: Solver | None = None,
     progress: Callable[[int, int], None] | None = None,
     energies: bool = False,
+    resume: str | pathlib.Path | None = None,
 ) -> list[Rollout]:
     """Several motions side by side; each result is cut to its motion's length.
 
@@ -123,19 +129,22 @@ def simulate_batch(
         solver: How the cloth moves; ``standard`` by default.
         progress: Called with frames done and frames in all.
         energies: Put the energy of each effect into the diagnostics.
+        resume: Folder that keeps what is done: the same call goes on from there after
+            it was stopped, and removes it at the end. None keeps nothing.
 
     Returns:
         One rollout a motion.
 
     Raises:
-        SimulationError: No motion, or motions of different frame rates.
+        SimulationError: No motion, motions of different frame rates, or a folder that
+            belongs to another rollout.
     """
     if not motions:
         raise SimulationError("No motion to simulate; give at least one.")
     solver = ACCURACY["standard"] if solver is None else solver
     # Only around what is traced and run: the rest of the process keeps its precision.
     with jax.enable_x64(solver.precision == "float64"):
-        return _roll(scene, motions, solver, progress, energies)
+        return _roll(scene, motions, solver, progress, energies, resume)
 
 
 def _roll(
@@ -144,6 +153,7 @@ def _roll(
     solver: Solver,
     progress: Callable[[int, int], None] | None,
     energies: bool,
+    resume: str | pathlib.Path | None,
 ) -> list[Rollout]:
     fps = motions[0].fps
     if any(m.fps != fps for m in motions):
@@ -185,8 +195,14 @@ def _roll(
     )
     # Time zero is the clip's first frame, whatever the lead-in's length.
     began = -(skipped - 1) / fps
-    positions, diagnostics = [np.asarray(x)[None]], []
-    for at in range(0, total - 1, _BLOCK):
+    store = None
+    positions: list[np.ndarray] = []
+    diagnostics: list[dict[str, np.ndarray]] = []
+    if resume is not None:
+        key = fingerprint(system, rotations, root, (solver, energies))
+        store = Resume(resume, key)
+        state, positions, diagnostics = store.load(state)
+    for at in range(_BLOCK * len(positions), total - 1, _BLOCK):
         part = slice(at, at + _BLOCK + 1)
         state, moved, info = advance(
             system,
@@ -200,10 +216,14 @@ def _roll(
         )
         positions.append(np.asarray(moved))
         diagnostics.append({k: np.asarray(v) for k, v in info.items()})
+        if store is not None:
+            store.save(len(positions) - 1, state, positions[-1], diagnostics[-1])
         if progress is not None:
             progress(min(at + _BLOCK, total - 1), total - 1)
+    if store is not None:
+        store.finish()
     # Diagnostics start at frame 1: the rest state has none, so the lead-in covers it.
-    every = np.concatenate(positions)
+    every = np.concatenate([np.asarray(x)[None], *positions])
     values = {k: np.concatenate([d[k] for d in diagnostics]) for k in diagnostics[0]}
     out = []
     for b, m in enumerate(motions):

@@ -15,7 +15,38 @@ from ._assembly import Assembly, assemble, float32
 from ._effect import Effect, Prepared
 from ._solver import Solver
 from ._state import System
-from .effects import Bend, BodyContact, Damping, Gravity, Pin, Stretch
+from .effects import (
+    Air,
+    Bend,
+    BodyContact,
+    Damping,
+    Dihedral,
+    Gravity,
+    LayerContact,
+    Membrane,
+    Pin,
+    Seam,
+    SelfContact,
+    StrainLimit,
+    Stretch,
+)
+
+EFFECTS: dict[str, type[Effect]] = {
+    "gravity": Gravity,
+    "damping": Damping,
+    "air": Air,
+    "stretch": Stretch,
+    "membrane": Membrane,
+    "bend": Bend,
+    "dihedral": Dihedral,
+    "seam": Seam,
+    "strain_limit": StrainLimit,
+    "self_contact": SelfContact,
+    "layer_contact": LayerContact,
+    "body_contact": BodyContact,
+    "pin": Pin,
+}
+"""Every effect by name, in the order in which they are best applied."""
 
 STANDARD: tuple[Effect, ...] = (
     Gravity(),
@@ -28,12 +59,21 @@ STANDARD: tuple[Effect, ...] = (
 """What clothes on a moving person call for, in the order they are applied."""
 
 
+def standard_effects(garments: int) -> tuple[Effect, ...]:
+    """`STANDARD`, and contact between layers if more than one garment is worn."""
+    if garments < 2:
+        return STANDARD
+    at = [type(e) for e in STANDARD].index(BodyContact)
+    return (*STANDARD[:at], LayerContact(), *STANDARD[at:])
+
+
 @dataclasses.dataclass(frozen=True)
 class Scene:
     """Garments worn on a body.
 
     Attributes:
-        garments: What is worn. Garments don't touch each other here.
+        garments: What is worn, the innermost first: with `LayerContact` each stays
+            over the ones before it, without it they don't touch.
         effects: What acts, in this order within a substep. An effect that isn't
             listed isn't computed.
         body: The body; the built-in one if None.

@@ -1,0 +1,104 @@
+"""Cloth in the body and body out of the cloth, on every frame of the 12 test actions.
+
+Command: python experiments/check_penetration.py
+         --data FOLDER (default: $PHYSXNET_DATA or ../shared), --accuracy standard
+Cost:    about 15 minutes on two cores; goes on where it was stopped.
+Result:  experiments/results/penetration.json and .md: for each action and template the
+         share of cloth vertices inside the nearest skin, how much of that lies where the
+         body passes through itself, the deepest vertex, the share of skin that sticks out
+         of the cloth over it, strain, and time. Measured on meshes, not by the simulator.
+"""
+
+import argparse
+import json
+import os
+import pathlib
+import time
+
+import jax
+import numpy as np
+from rich.progress import track
+
+from physxnet_jax.data import load_action, read_protocol
+from physxnet_jax.evaluation import edge_strain, penetration
+from physxnet_jax.files import whole_file
+from physxnet_jax.garment import TEMPLATES, template
+from physxnet_jax.simulation import ACCURACY, Scene, Status, prepare_scene, simulate_batch
+
+RESULTS = pathlib.Path(__file__).parent / "results"
+
+
+def one(name: str, action, folder: pathlib.Path, accuracy: str) -> dict:
+    scene = prepare_scene(Scene((template(name),)))
+    motion = load_action(folder / "mocap", action)
+    ticks = [time.perf_counter()]
+    out = simulate_batch(
+        scene,
+        [motion],
+        solver=ACCURACY[accuracy],
+        progress=lambda *_: ticks.append(time.perf_counter()),
+    )[0]
+    x = out.positions[0]
+    seen = penetration(scene.assembly, motion, x)
+    strain = edge_strain(scene.assembly, x)
+    acceleration = np.diff(x, n=2, axis=0) * motion.fps**2
+    return {
+        "action": action.name,
+        "template": name,
+        "frames": len(x),
+        "inside_share": float(seen.cloth_inside.mean()),
+        "inside_elsewhere_share": float(seen.elsewhere.mean()),
+        "deepest_mm": 1e3 * float(seen.depth.max()),
+        "deepest_own_mm": 1e3 * float(np.where(seen.elsewhere, 0, seen.depth).max()),
+        "frames_with_any_inside": int(seen.cloth_inside.any(axis=1).sum()),
+        "skin_outside_share": float(seen.skin_outside.mean()),
+        "strain_p99": float(np.quantile(strain, 0.99)),
+        "strain_max": float(strain.max()),
+        "acceleration_median": float(np.median(np.linalg.norm(acceleration, axis=2))),
+        "frames_pinched": int(((out.status & int(Status.PINCHED)) > 0).sum()),
+        "ms_per_frame": 100 * float(np.median(np.diff(ticks)[1:])),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--data", default=os.environ.get("PHYSXNET_DATA", "../shared"))
+    parser.add_argument("--accuracy", default="standard", choices=tuple(ACCURACY))
+    words = parser.parse_args()
+    folder = pathlib.Path(words.data)
+    path = RESULTS / "penetration.json"
+    rows = json.loads(path.read_text())["rows"] if path.is_file() else []
+    done = {(r["action"], r["template"]) for r in rows}
+    actions = [a for a in read_protocol(folder / "mocap") if a.split == "test"]
+    jobs = [(n, a) for n in TEMPLATES for a in actions if (a.name, n) not in done]
+    for name, action in track(jobs, description="actions"):
+        rows.append(one(name, action, folder, words.accuracy))
+        jax.clear_caches()
+        with whole_file(path) as part:
+            part.write_text(json.dumps({"accuracy": words.accuracy, "rows": rows}, indent=1) + "\n")
+    lines = [
+        "| template | frames | inside | of it where the body meets itself | deepest mm (own skin) |"
+        " skin outside | strain p99 | ms/frame |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name in TEMPLATES:
+        mine = [r for r in rows if r["template"] == name]
+        n = np.asarray([r["frames"] for r in mine])
+
+        def mean(key: str, mine: list = mine, n: np.ndarray = n) -> float:
+            return float(np.average([r[key] for r in mine], weights=n))
+
+        lines.append(
+            f"| {name} | {n.sum()} | {100 * mean('inside_share'):.3f} % |"
+            f" {100 * mean('inside_elsewhere_share'):.3f} % |"
+            f" {max(r['deepest_mm'] for r in mine):.1f}"
+            f" ({max(r['deepest_own_mm'] for r in mine):.1f}) |"
+            f" {100 * mean('skin_outside_share'):.3f} % | {mean('strain_p99'):.3f} |"
+            f" {np.median([r['ms_per_frame'] for r in mine]):.1f} |"
+        )
+    with whole_file(path.with_suffix(".md")) as part:
+        part.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

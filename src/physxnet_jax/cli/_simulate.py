@@ -1,0 +1,193 @@
+"""`physxnet simulate` and `physxnet effects`."""
+
+import dataclasses
+import json
+import pathlib
+import time
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from ..body import load_body
+from ..dressing import SceneFile, animated_meshes, load_scene, make_scene
+from ..errors import FormatError
+from ..evaluation import price_effects, recommend_effects
+from ..files import whole_file
+from ..io import check_output, write_clip
+from ..simulation import (
+    ACCURACY,
+    Air,
+    Effect,
+    Implicit,
+    Rollout,
+    SelfContact,
+    Status,
+    prepare_scene,
+    simulate_batch,
+)
+from ..simulation.blender import simulate_blender
+from ..viewer import check_preview, render_preview
+from ._commands import Effects, Simulate
+from ._progress import progress_bars
+
+
+def simulate(command: Simulate, console: Console) -> int:
+    """Simulates, writes, and says how it went."""
+    if command.out is not None:
+        check_output(command.out)
+    if command.preview is not None:
+        check_preview(command.preview)
+    also: list[Effect] = []
+    if command.wind is not None:
+        also.append(Air(wind=command.wind))
+    if command.self_contact:
+        also.append(SelfContact())
+    if _is_scene(command.scene):
+        job = load_scene(command.scene)
+        if command.fabric is not None or also:
+            raise FormatError(
+                f"{command.scene}: a scene file names its fabrics and effects itself; leave"
+                " --fabric, --wind and --self-contact out."
+            )
+    else:
+        job = make_scene(
+            command.scene,
+            command.wear,
+            fps=command.fps,
+            frames=command.frames,
+            fabric=command.fabric,
+            also=also,
+        )
+    scene = job.scene
+    accuracy = command.accuracy or job.accuracy
+    out = command.out or command.preview
+    keep = None if out is None else out.with_name(f".{out.name}.unfinished")
+    began = time.perf_counter()
+    with progress_bars(console) as bars:
+
+        def progress(done: int, total: int) -> None:
+            bars("simulation", done, total)
+
+        if command.engine == "blender":
+            rollout = simulate_blender(scene, job.motion, progress=progress)
+        else:
+            solver = Implicit(16, 4) if command.engine == "bdf2" else ACCURACY[accuracy]
+            rollout = simulate_batch(
+                prepare_scene(scene), [job.motion], solver=solver, progress=progress, resume=keep
+            )[0]
+        took = time.perf_counter() - began
+        rollout.check()
+        names = [g.name for g in scene.garments]
+        positions = dict(zip(names, rollout.positions, strict=True))
+        body = scene.body or load_body()
+        meshes = animated_meshes(
+            body, job.motion, scene.shape, scene.garments, positions, command.body
+        )
+        written = [] if command.out is None else write_clip(command.out, meshes, rollout.fps)
+        if command.preview is not None:
+            written.append(render_preview(command.preview, meshes, rollout.fps, progress=bars))
+    console.print(_summary(rollout, scene.effects, took))
+    for path in written:
+        console.print(f"wrote {path} (import at {rollout.fps:g} fps)", highlight=False)
+    return 0
+
+
+def _is_scene(word: str) -> bool:
+    return pathlib.Path(word).suffix.lower() == ".toml"
+
+
+_SHOWN = {
+    "strain_p99": ("strain, 99th percentile (%)", 100.0),
+    "strain_max": ("strain, worst edge (%)", 100.0),
+    "penetration_max": ("deepest in the skin (mm)", 1e3),
+    "inside_share": ("vertices in the skin, worst frame (%)", 100.0),
+    "layers_crossed": ("vertices in the wrong layer, worst frame", 1.0),
+    "pinched": ("vertices within another limb, worst frame", 1.0),
+    "residual_p99": ("residual, 99th percentile (1 = tolerance)", 1.0),
+    "speed_max": ("fastest vertex (m/s)", 1.0),
+}
+
+
+def _summary(rollout: Rollout, effects: tuple[Effect, ...], took: float) -> Table:
+    frames = len(rollout.finite)
+    table = Table(
+        title=f"{frames} frames in {took:.1f} s; {', '.join(type(e).__name__ for e in effects)}",
+        title_justify="left",
+    )
+    table.add_column("over all frames")
+    table.add_column("worst", justify="right")
+    for key, (name, scale) in _SHOWN.items():
+        if key in rollout.diagnostics:
+            table.add_row(name, f"{scale * float(np.max(rollout.diagnostics[key])):.3g}")
+    for flag in Status:
+        count = int(np.count_nonzero(rollout.status & int(flag)))
+        if count:
+            table.add_row(f"frames marked {flag.name}", str(count))
+    return table
+
+
+def price(command: Effects, console: Console) -> int:
+    """Prints the price list of a scene's effects, or what is recommended."""
+    if _is_scene(command.scene):
+        job = load_scene(command.scene)
+        if command.frames is not None:
+            motion = dataclasses.replace(
+                job.motion,
+                rotations=job.motion.rotations[: command.frames],
+                root=job.motion.root[: command.frames],
+            )
+            job = SceneFile(job.scene, motion, job.accuracy)
+    else:
+        job = make_scene(command.scene, command.wear, frames=command.frames)
+    solver = ACCURACY[job.accuracy]
+    with progress_bars(console) as bars:
+        rows = price_effects(
+            job.scene, job.motion, solver=solver, progress=lambda d, t: bars("effects", d, t)
+        )
+        advice = []
+        if command.recommend:
+            advice = recommend_effects(
+                job.scene,
+                job.motion,
+                solver=solver,
+                tolerance=1e-3 * command.tolerance,
+                rows=rows,
+                progress=lambda d, t: bars("recommendation", d, t),
+            )
+    table = Table(
+        title=f"{rows[0].frames} frames: the scene, then without each of its effects",
+        caption="strain: 99th percentile; ms: a frame; Mflop: every loop's body once",
+        title_justify="left",
+    )
+    table.add_column("without")
+    for column in (
+        "rms (mm)",
+        "max (mm)",
+        "strain p99",
+        "inside",
+        "ms a frame",
+        "Mflop (loops once)",
+    ):
+        table.add_column(column, justify="right")
+    for r in rows:
+        table.add_row(
+            r.without or "nothing",
+            f"{r.rms_mm:.2f}",
+            f"{r.max_mm:.1f}",
+            f"{r.strain_p99:.3f}",
+            f"{100 * r.inside_share:.2f} %",
+            f"{r.ms_per_frame:.1f}",
+            f"{r.mflop:.2f}",
+        )
+    console.print(table)
+    for a in advice:
+        console.print(f"{a.effect}: {'needed' if a.needed else 'not needed'}. {a.why}")
+    if command.json is not None:
+        data = {
+            "effects": [dataclasses.asdict(r) for r in rows],
+            "recommendation": [dataclasses.asdict(a) for a in advice],
+        }
+        with whole_file(command.json) as part:
+            part.write_text(json.dumps(data, indent=1) + "\n")
+    return 0

@@ -1,0 +1,71 @@
+"""What is written and shown: the body and its garments as animated meshes."""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..body import Body
+from ..errors import PhysXNetError
+from ..garment import Garment
+from ..io import AnimatedMesh
+from ..motion import Motion, body_animation
+
+_COLOURS = ((0.16, 0.27, 0.55), (0.55, 0.28, 0.20), (0.25, 0.45, 0.30), (0.45, 0.25, 0.45))
+_SKIN_COLOUR = (0.69, 0.46, 0.33)
+
+
+def animated_meshes(
+    body: Body,
+    clip: Motion,
+    shape: Any | None,
+    garments: Sequence[Garment],
+    positions: Mapping[str, np.ndarray],
+    include_body: bool = True,
+) -> tuple[AnimatedMesh, ...]:
+    """The body (unless left out) and the garments, in the order given.
+
+    Args:
+        body: The body.
+        clip: Its motion.
+        shape: Its shape parameters; the default if None.
+        garments: What is worn.
+        positions: Of each garment by name [m], shape [frames, vertices, 3].
+        include_body: Whether the body comes first.
+    """
+    meshes = []
+    if include_body:
+        mesh = body.rest_mesh()
+        meshes.append(
+            AnimatedMesh(
+                "body",
+                np.asarray(body_animation(body, clip, shape)),
+                np.asarray(mesh.faces),
+                np.asarray(mesh.uv),
+                np.asarray(mesh.uv_faces),
+                _SKIN_COLOUR,
+            )
+        )
+    for k, g in enumerate(garments):
+        uv = None if g.mesh.uv is None else np.asarray(g.mesh.uv)
+        uv_faces = None if g.mesh.uv_faces is None else np.asarray(g.mesh.uv_faces)
+        colour = _COLOURS[k % len(_COLOURS)]
+        faces = np.asarray(g.mesh.faces)
+        meshes.append(AnimatedMesh(g.name, positions[g.name], faces, uv, uv_faces, colour))
+    return tuple(meshes)
+
+
+def with_names(garments: list[Garment]) -> list[Garment]:
+    """Garments with names that differ."""
+    taken = {"body"}
+    out = []
+    for g in garments:
+        name, count = g.name, 2
+        while name in taken:
+            name, count = f"{g.name}_{count}", count + 1
+        taken.add(name)
+        out.append(dataclasses.replace(g, name=name))
+    if not out:
+        raise PhysXNetError("Nothing to wear: name at least one garment.")
+    return out

@@ -1,0 +1,178 @@
+"""Scenes from TOML files: motion, garments, effects, accuracy."""
+
+import dataclasses
+import pathlib
+import tomllib
+from collections.abc import Sequence
+from typing import Any
+
+from jaxtyping import Array, Float
+
+from ..body import load_body
+from ..errors import FormatError
+from ..garment import FABRICS, Garment
+from ..io import load_garment
+from ..motion import Motion, load_motion
+from ..simulation import ACCURACY, EFFECTS, Effect, Scene, standard_effects
+from ._blocks import inside_out
+from ._meshes import with_names
+
+_KEYS = ("motion", "fps", "frames", "accuracy", "garments", "shape", "effects", "also")
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneFile:
+    """A scene with the motion it is simulated through.
+
+    Attributes:
+        scene: Garments, effects, shape.
+        motion: The body's motion.
+        accuracy: ``draft``, ``standard`` or ``fine``.
+    """
+
+    scene: Scene
+    motion: Motion
+    accuracy: str = "standard"
+
+
+def make_scene(
+    motion: str | pathlib.Path | Motion,
+    wear: Sequence[str | pathlib.Path | Garment] = ("top", "bottom"),
+    *,
+    fps: float = 30.0,
+    frames: int | None = None,
+    accuracy: str = "standard",
+    fabric: str | None = None,
+    shape: Float[Array, " shapes"] | None = None,
+    effects: Sequence[Effect] | None = None,
+    also: Sequence[Effect] = (),
+) -> SceneFile:
+    """A scene from names and files.
+
+    Args:
+        motion: A motion, a motion file, or the name of a built-in clip.
+        wear: Garments, OBJ files or template names; put into the order of layers.
+        fps: Frames a second.
+        frames: Keep only this many frames.
+        accuracy: ``draft``, ``standard`` or ``fine``.
+        fabric: Name of a fabric for all garments; their own if None.
+        shape: Shape parameters; the default shape if omitted.
+        effects: What acts; `standard_effects` if None.
+        also: Effects that act besides those; one of the same kind is replaced.
+
+    Raises:
+        PhysXNetError: What can't be read or isn't known; the text says what there is.
+    """
+    if accuracy not in ACCURACY:
+        raise FormatError(f"No accuracy '{accuracy}'; there are {', '.join(ACCURACY)}.")
+    if fabric is not None and fabric not in FABRICS:
+        raise FormatError(f"No fabric '{fabric}'; there are {', '.join(FABRICS)}.")
+    body = load_body()
+    if isinstance(motion, Motion):
+        clip = motion
+    else:
+        clip = load_motion(motion, fps=fps, body=body, shape=shape)
+    if frames is not None:
+        if frames < 1:
+            raise FormatError(f"frames is {frames}; ask for at least one.")
+        clip = dataclasses.replace(clip, rotations=clip.rotations[:frames], root=clip.root[:frames])
+    garments = with_names(
+        [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
+    )
+    if fabric is not None:
+        garments = [dataclasses.replace(g, fabric=FABRICS[fabric]) for g in garments]
+    garments = inside_out(garments)
+    acting = standard_effects(len(garments)) if effects is None else tuple(effects)
+    return SceneFile(Scene(tuple(garments), _merged(acting, also), body, shape), clip, accuracy)
+
+
+def load_scene(path: str | pathlib.Path) -> SceneFile:
+    """Reads a scene from TOML; files in it are looked for beside it.
+
+    ::
+
+        motion = "walk"            # a built-in clip or a motion file
+        garments = ["bottom", "top"]
+        frames = 60
+        accuracy = "standard"
+
+        [[garments]]               # instead of the list, to choose fabrics
+        file = "top"
+        fabric = "silk"
+
+        [also.air]                 # besides what `standard_effects` gives
+        wind = [0.0, 0.0, 4.0]
+
+        [effects.gravity]          # or every effect that acts, and no other
+
+    Raises:
+        FormatError: Not TOML, an unknown key, effect or setting.
+    """
+    path = pathlib.Path(path)
+    try:
+        text = tomllib.loads(path.read_text())
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise FormatError(f"{path}: not a scene in TOML: {error}.") from None
+    unknown = sorted(set(text) - set(_KEYS))
+    if unknown or "motion" not in text:
+        wrong = f"unknown key {unknown[0]}" if unknown else "no key motion"
+        raise FormatError(f"{path}: {wrong}; a scene has {', '.join(_KEYS)}.")
+    words = [
+        {"file": g} if isinstance(g, str) else g for g in text.get("garments", ["top", "bottom"])
+    ]
+    garments = []
+    for g in words:
+        if set(g) - {"file", "fabric"} or "file" not in g:
+            raise FormatError(f"{path}: a garment has file and fabric, not {', '.join(g)}.")
+        garment = load_garment(_beside(path, g["file"]), body=load_body())[0]
+        if "fabric" in g:
+            if g["fabric"] not in FABRICS:
+                raise FormatError(
+                    f"{path}: no fabric '{g['fabric']}'; there are {', '.join(FABRICS)}."
+                )
+            garment = dataclasses.replace(garment, fabric=FABRICS[g["fabric"]])
+        garments.append(garment)
+    return make_scene(
+        _beside(path, text["motion"]),
+        garments,
+        fps=float(text.get("fps", 30.0)),
+        frames=text.get("frames"),
+        accuracy=text.get("accuracy", "standard"),
+        shape=load_body().shape(**text["shape"]) if "shape" in text else None,
+        effects=_effects(path, text["effects"]) if "effects" in text else None,
+        also=_effects(path, text.get("also", {})),
+    )
+
+
+def _beside(path: pathlib.Path, word: str) -> str | pathlib.Path:
+    there = path.parent / word
+    return there if there.is_file() else word
+
+
+def _effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:
+    out = []
+    for name, settings in table.items():
+        if name not in EFFECTS:
+            raise FormatError(f"{path}: no effect '{name}'; there are {', '.join(EFFECTS)}.")
+        kind = EFFECTS[name]
+        fields = {f.name: f for f in dataclasses.fields(kind)}
+        unknown = sorted(set(settings) - set(fields))
+        if unknown:
+            there = ", ".join(fields) or "no settings"
+            raise FormatError(f"{path}: {name} has no '{unknown[0]}'; it has {there}.")
+        out.append(kind(**{k: _value(fields[k], v) for k, v in settings.items()}))
+    return out
+
+
+def _value(field: dataclasses.Field, value: Any) -> Any:
+    if isinstance(value, list):
+        return tuple(_value(field, v) for v in value)
+    wants_float = field.type is float or "float" in str(field.type)
+    return float(value) if isinstance(value, int) and wants_float else value
+
+
+def _merged(effects: Sequence[Effect], also: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Both together, in the order of `EFFECTS`."""
+    kinds = {type(e): e for e in (*effects, *also)}
+    rank = list(EFFECTS.values())
+    return tuple(sorted(kinds.values(), key=lambda e: rank.index(type(e))))

@@ -1,0 +1,240 @@
+"""What each effect of a scene costs, and what it changes."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..motion import Motion
+from ..simulation import (
+    Air,
+    BodyContact,
+    Effect,
+    LayerContact,
+    PreparedScene,
+    Rollout,
+    Scene,
+    SelfContact,
+    Solver,
+    State,
+    advance,
+    prepare_scene,
+    simulate_batch,
+)
+from ._penetration import penetration
+from ._strain import edge_strain
+
+_LOOKED_AT = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class Price:
+    """A scene without one of its effects, beside the whole scene.
+
+    Attributes:
+        without: The effect left out; empty for the whole scene.
+        frames: Frames that were simulated.
+        rms_mm: Distance to the whole scene's cloth, over vertices and frames [mm].
+        max_mm: Its maximum [mm].
+        strain_p99: 99th percentile of the strain of edges, over all frames.
+        inside_share: Share of vertices inside the body, in some of the frames.
+        ms_per_frame: Median time [ms], warm.
+        mflop: Of the program as XLA counts them, every loop's body once: a frame of one
+            block of one substep [Mflop].
+        cold_s: Time of the first frames with their compilation [s].
+    """
+
+    without: str
+    frames: int
+    rms_mm: float
+    max_mm: float
+    strain_p99: float
+    inside_share: float
+    ms_per_frame: float
+    mflop: float
+    cold_s: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Advice:
+    """Whether an effect is called for.
+
+    Attributes:
+        effect: Its name.
+        needed: It changes more than the tolerance.
+        why: What was measured.
+    """
+
+    effect: str
+    needed: bool
+    why: str
+
+
+def price_effects(
+    scene: Scene,
+    motion: Motion,
+    *,
+    solver: Solver,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Price]:
+    """Simulates a scene whole and without each of its effects in turn.
+
+    Args:
+        scene: The scene.
+        motion: The motion; a second of it says much.
+        solver: How the cloth moves.
+        progress: Called with variants done and variants in all.
+
+    Returns:
+        The whole scene's row, then one for each effect.
+    """
+    variants = [("", scene.effects)]
+    variants += [
+        (type(e).__name__, tuple(x for x in scene.effects if x is not e)) for e in scene.effects
+    ]
+    rows: list[Price] = []
+    whole: Rollout | None = None
+    for k, (name, effects) in enumerate(variants):
+        row, rollout = _measure(
+            dataclasses.replace(scene, effects=effects), motion, solver, whole, name
+        )
+        whole = rollout if whole is None else whole
+        rows.append(row)
+        # Programs of other effects are never run again.
+        jax.clear_caches()
+        if progress is not None:
+            progress(k + 1, len(variants))
+    return rows
+
+
+def recommend_effects(
+    scene: Scene,
+    motion: Motion,
+    *,
+    solver: Solver,
+    tolerance: float = 2e-3,
+    rows: Sequence[Price] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Advice]:
+    """Which effects matter for a scene, by measurement.
+
+    Those it has are left out one by one (`price_effects`); of those it hasn't, drag of
+    still air, self-contact and contact of layers are put in.
+
+    Args:
+        scene: The scene.
+        motion: The motion.
+        solver: How the cloth moves.
+        tolerance: What matters: a difference of the mean vertex [m].
+        rows: What `price_effects` gave, if it was called before.
+        progress: Called with variants done and variants in all.
+    """
+    rows = price_effects(scene, motion, solver=solver) if rows is None else rows
+    base = rows[0]
+    out = []
+    for r in rows[1:]:
+        inside = r.inside_share - base.inside_share
+        strain = r.strain_p99 - base.strain_p99
+        needed = r.rms_mm > 1e3 * tolerance or inside > 1e-3 or strain > 0.05
+        out.append(
+            Advice(
+                r.without,
+                needed,
+                f"Without it the cloth is {r.rms_mm:.1f} mm elsewhere, {100 * inside:+.1f} % of it"
+                f" inside the body, strain {100 * strain:+.0f} %; it costs"
+                f" {base.ms_per_frame - r.ms_per_frame:.1f} ms a frame.",
+            )
+        )
+    kinds = {type(e) for e in scene.effects}
+    extra: list[Effect] = [Air()] if Air not in kinds else []
+    if SelfContact not in kinds:
+        extra.append(SelfContact())
+    if LayerContact not in kinds and len(scene.garments) > 1:
+        extra.append(LayerContact())
+    whole: Rollout | None = None
+    for k, e in enumerate(extra):
+        if whole is None:
+            whole = _measure(scene, motion, solver, None, "")[1]
+        at = next(
+            (i for i, x in enumerate(scene.effects) if isinstance(x, BodyContact)),
+            len(scene.effects),
+        )
+        effects = (*scene.effects[:at], e, *scene.effects[at:])
+        row, rollout = _measure(
+            dataclasses.replace(scene, effects=effects), motion, solver, whole, ""
+        )
+        name = type(e).__name__
+        said = (
+            f"With it the cloth is {row.rms_mm:.1f} mm elsewhere; it costs"
+            f" {row.ms_per_frame - base.ms_per_frame:.1f} ms a frame."
+        )
+        needed = row.rms_mm > 1e3 * tolerance
+        if isinstance(e, SelfContact):
+            least = float(rollout.diagnostics["self_gap"].min())
+            if least >= e.gap:
+                needed = False
+                said = f"Cloth never comes nearer to itself than {1e3 * min(least, 1.0):.1f} mm."
+        out.append(Advice(name, needed, said))
+        jax.clear_caches()
+        if progress is not None:
+            progress(k + 1, len(extra))
+    return out
+
+
+def _measure(
+    scene: Scene, motion: Motion, solver: Solver, whole: Rollout | None, name: str
+) -> tuple[Price, Rollout]:
+    prepared = prepare_scene(scene)
+    flops = program_flops(prepared, solver, motion.fps)
+    ticks = [time.perf_counter()]
+    rollout = simulate_batch(
+        prepared, [motion], solver=solver, progress=lambda *_: ticks.append(time.perf_counter())
+    )[0]
+    laps = np.diff(ticks)
+    x = np.concatenate(rollout.positions, axis=1)
+    gap = np.zeros(1)
+    if whole is not None:
+        gap = np.linalg.norm(x - np.concatenate(whole.positions, axis=1), axis=2)
+    looked = np.linspace(0, len(x) - 1, min(_LOOKED_AT, len(x))).astype(int)
+    inside = penetration(prepared.assembly, motion, x, frames=looked)
+    return (
+        Price(
+            name,
+            len(x),
+            1e3 * float(np.sqrt((gap**2).mean())),
+            1e3 * float(gap.max()),
+            float(np.quantile(edge_strain(prepared.assembly, x), 0.99)),
+            float(inside.cloth_inside.mean()),
+            1e3 * float(np.median(laps[1:] if len(laps) > 1 else laps)) / 10,
+            flops / 1e6,
+            float(laps[0]),
+        ),
+        rollout,
+    )
+
+
+def program_flops(scene: PreparedScene, solver: Solver, fps: float) -> float:
+    """Floating point operations of a frame's program, every loop's body counted once."""
+    system = scene.system(solver)
+    n, joints = len(scene.assembly.rest), len(scene.assembly.body.joint_names)
+    x = jnp.zeros((n, 3, 1), solver.precision)
+    state = State(
+        x,
+        x,
+        solver.remember(x, 1.0 / (fps * solver.substeps)),
+        tuple(e.initial(1) for e in system.effects),
+    )
+    frame = advance.lower(
+        system,
+        state,
+        jnp.zeros((2, 1, joints, 4), solver.precision),
+        jnp.zeros((2, 1, 3), solver.precision),
+        solver=solver,
+        fps=fps,
+        time=jnp.zeros((), solver.precision),
+    )
+    cost = frame.cost_analysis() or {}
+    return float(cost.get("flops", 0.0))

@@ -1,0 +1,77 @@
+"""Rollouts that go on where they were stopped."""
+
+import hashlib
+import pathlib
+import shutil
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..errors import SimulationError
+from ..files import whole_file
+
+
+class Resume:
+    """A folder that holds the blocks of a rollout that are done.
+
+    Each block is one file, written whole or not at all, with the cloth's state at its
+    end; the folder belongs to one scene, motion and solver, and refuses others.
+
+    Args:
+        folder: Where blocks are kept; made if needed, removed by `finish`.
+        key: What the rollout is, see `fingerprint`.
+
+    Raises:
+        SimulationError: The folder holds another rollout.
+    """
+
+    def __init__(self, folder: str | pathlib.Path, key: str) -> None:
+        self.folder = pathlib.Path(folder)
+        label = self.folder / "key.txt"
+        if label.is_file() and label.read_text() != key:
+            raise SimulationError(
+                f"{self.folder} holds an unfinished rollout of another scene, motion or"
+                " setting. Finish that one, or remove the folder."
+            )
+        with whole_file(label) as part:
+            part.write_text(key)
+
+    def load(self, state: Any) -> tuple[Any, list[np.ndarray], list[dict[str, np.ndarray]]]:
+        """The last state (of the given structure), positions and diagnostics of blocks."""
+        positions, diagnostics = [], []
+        leaves, tree = jax.tree.flatten(state)
+        while self._path(len(positions)).is_file():
+            with np.load(self._path(len(positions))) as data:
+                positions.append(data["positions"])
+                diagnostics.append({k[5:]: data[k] for k in data.files if k.startswith("info_")})
+                leaves = [jnp.asarray(data[f"state_{i}"]) for i in range(len(leaves))]
+        return jax.tree.unflatten(tree, leaves), positions, diagnostics
+
+    def save(
+        self, index: int, state: Any, positions: np.ndarray, diagnostics: dict[str, np.ndarray]
+    ) -> None:
+        """Keeps one block."""
+        arrays = {f"state_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
+        arrays |= {f"info_{k}": v for k, v in diagnostics.items()}
+        with whole_file(self._path(index)) as part, part.open("wb") as file:
+            np.savez(file, allow_pickle=False, positions=positions, **arrays)
+
+    def finish(self) -> None:
+        """Removes the folder."""
+        shutil.rmtree(self.folder)
+
+    def _path(self, index: int) -> pathlib.Path:
+        return self.folder / f"block_{index:05d}.npz"
+
+
+def fingerprint(*trees: Any) -> str:
+    """A hash of pytrees: their arrays and all that is static in them."""
+    digest = hashlib.sha256()
+    for tree in trees:
+        leaves, structure = jax.tree.flatten(tree)
+        digest.update(str(structure).encode())
+        for x in leaves:
+            digest.update(np.ascontiguousarray(x).tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,161 @@
+"""Hands a scene to Blender and takes back the cloth."""
+
+import dataclasses
+import json
+import os
+import pathlib
+import re
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Callable
+
+import numpy as np
+
+from ...body import NUM_BODY_VERTICES, triangulate
+from ...errors import MissingDependencyError, SimulationError
+from ...motion import Motion, animate
+from .._assembly import float32
+from .._diagnostics import Rollout
+from .._rollout import lead_in
+from .._scene import Scene, prepare_scene
+
+_SCRIPT = pathlib.Path(__file__).with_name("_script.py")
+
+
+@dataclasses.dataclass(frozen=True)
+class BlenderSettings:
+    """Settings of Blender's cloth modifier: its own preset for cotton.
+
+    Attributes:
+        quality: Substeps a frame. At 12, 19, 23, 27, 28, 40, 50 and 60 Blender's loop runs
+            one more than asked for; 5, 10, 15 and 20 are right.
+        self_collision: Cloth collides with itself.
+        distance: Collision distance of cloth and of skin, each [m]; at least 0.001.
+        tension: Stiffness of springs; shear and compression are the same.
+        bending: Angular bending stiffness.
+        damping: Of all springs.
+        bending_damping: Of bending.
+        air: Drag of the air.
+        friction: Of the skin.
+        mass: Of every vertex [kg], as Blender counts it: the preset's value, whatever the
+            mesh. Masses of real cloth (1e-4) make its solver burst at these stiffnesses.
+    """
+
+    quality: int = 10
+    self_collision: bool = False
+    distance: float = 0.005
+    tension: float = 15.0
+    bending: float = 0.5
+    damping: float = 5.0
+    bending_damping: float = 0.5
+    air: float = 1.0
+    friction: float = 5.0
+    mass: float = 0.3
+
+
+def find_blender() -> list[str]:
+    """The command that runs a script in Blender: ``PHYSXNET_BLENDER``, or ``blender``.
+
+    ``PHYSXNET_BLENDER`` names a Blender, or a Python that has ``bpy`` installed.
+
+    Raises:
+        MissingDependencyError: There is neither.
+    """
+    program = os.environ.get("PHYSXNET_BLENDER") or shutil.which("blender")
+    if program is None or shutil.which(program) is None:
+        raise MissingDependencyError(
+            "No Blender: install it, or set PHYSXNET_BLENDER to a Blender or to a Python"
+            " that has bpy (pip install bpy, in an environment of its own)."
+        )
+    if "blender" in pathlib.Path(program).name.lower():
+        return [program, "--background", "--python-exit-code", "1", "--python", str(_SCRIPT), "--"]
+    return [program, str(_SCRIPT)]
+
+
+def simulate_blender(
+    scene: Scene,
+    motion: Motion,
+    *,
+    settings: BlenderSettings | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Rollout:
+    """Simulates a scene in Blender, with the lead-in that `simulate` has.
+
+    Garments don't touch each other; effects of the scene are not looked at, only its
+    garments, body and shape. Blender's model differs from ours (springs of its own
+    units), so its answer is another cloth's, not a check of ours.
+
+    Args:
+        scene: Garments and body.
+        motion: The body's motion.
+        settings: Of the cloth modifier.
+        progress: Called with frames done and frames in all.
+
+    Returns:
+        Positions, and as diagnostics ``finite``, ``speed_max``, ``worst_vertex``,
+        ``residual_p99`` (zero: Blender gives none) and ``milliseconds`` of each frame.
+
+    Raises:
+        MissingDependencyError: No Blender.
+        SimulationError: Blender failed; its last words are given.
+    """
+    settings = BlenderSettings() if settings is None else settings
+    command = find_blender()
+    scene = dataclasses.replace(scene, effects=())
+    assembly = prepare_scene(scene).assembly
+    body = assembly.body
+    rest = float32(assembly.rest_body)
+    lead = lead_in(body, motion)
+    skipped = lead.num_frames - 1
+    every = Motion(
+        np.concatenate([lead.rotations, motion.rotations[1:]]),  # pyright: ignore[reportArgumentType]
+        np.concatenate([lead.root, motion.root[1:]]),  # pyright: ignore[reportArgumentType]
+        motion.fps,
+    )
+    skin = animate(body, rest, rest[:NUM_BODY_VERTICES], body.weights[:NUM_BODY_VERTICES], every)
+    cloth = animate(body, rest, float32(assembly.rest), float32(assembly.weights), every)
+    arrays: dict[str, np.ndarray] = {
+        "skin": np.asarray(skin, np.float32),
+        "skin_faces": np.asarray(triangulate(body.quads)),
+        "parts": np.asarray(assembly.parts),
+        "cloth": np.asarray(cloth, np.float32),
+        "cloth_rest": assembly.rest.astype(np.float32),
+        "cloth_faces": assembly.faces,
+        "pinned": assembly.pinned,
+        "fps": np.asarray(motion.fps),
+    }
+    total = every.num_frames
+    with tempfile.TemporaryDirectory(prefix="physxnet_blender_") as name:
+        folder = pathlib.Path(name)
+        np.savez(folder / "scene.npz", allow_pickle=False, **arrays)
+        (folder / "settings.json").write_text(json.dumps(dataclasses.asdict(settings)))
+        said: list[str] = []
+        with subprocess.Popen(
+            [*command, str(folder)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ) as process:
+            assert process.stdout is not None
+            for line in process.stdout:
+                said.append(line.rstrip())
+                done = re.match(r"frame (\d+)", line)
+                if done and progress is not None:
+                    progress(int(done.group(1)), total)
+        result = folder / "cloth.npz"
+        if process.returncode != 0 or not result.is_file():
+            raise SimulationError(
+                f"Blender ended with code {process.returncode}: {' | '.join(said[-5:])}"
+            )
+        with np.load(result) as data:
+            positions, taken = data["positions"], data["milliseconds"]
+    positions = positions[skipped:]
+    speed = np.zeros(positions.shape[:2])
+    speed[1:] = np.linalg.norm(np.diff(positions, axis=0), axis=2) * motion.fps
+    diagnostics = {
+        "finite": np.isfinite(positions).all(axis=(1, 2)),
+        "speed_max": speed.max(axis=1),
+        "worst_vertex": speed.argmax(axis=1),
+        "residual_p99": np.zeros(len(positions)),
+        "milliseconds": taken[skipped:],
+    }
+    pieces = tuple(positions[:, i:j] for i, j in zip(assembly.parts, assembly.parts[1:]))
+    return Rollout(pieces, motion.fps, diagnostics, motion.name)

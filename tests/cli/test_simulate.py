@@ -1,0 +1,155 @@
+"""`physxnet simulate` and `physxnet effects`: scenes, resuming, what is said and written."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from physxnet_jax.cli import main
+from physxnet_jax.dressing import load_scene, make_scene
+from physxnet_jax.errors import FormatError, MissingDependencyError, SimulationError
+from physxnet_jax.evaluation import price_effects, recommend_effects
+from physxnet_jax.garment import square_sheet
+from physxnet_jax.motion import load_motion
+from physxnet_jax.simulation import (
+    XPBD,
+    Air,
+    BodyContact,
+    Gravity,
+    LayerContact,
+    Pin,
+    Scene,
+    Stretch,
+    prepare_scene,
+    simulate_batch,
+)
+from physxnet_jax.simulation.blender import find_blender
+
+TOML = """
+motion = "balance"
+frames = 4
+accuracy = "draft"
+[[garments]]
+file = "bottom"
+fabric = "silk"
+[also.air]
+wind = [0, 0, 4]
+"""
+
+
+def test_a_scene_file_is_simulated_and_written(tmp_path, capsys):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(TOML)
+    out = tmp_path / "a.npz"
+    assert main(["simulate", str(scene), "-o", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "Air" in said and "deepest in the skin" in said
+    with np.load(out) as data:
+        assert data["bottom_positions"].shape == (4, 2726, 3)
+        assert np.isfinite(data["bottom_positions"]).all()
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "scene.toml"]
+
+
+def test_scene_files_say_what_they_hold(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(TOML)
+    job = load_scene(path)
+    assert job.scene.garments[0].fabric.density == 0.07
+    assert Air(wind=(0.0, 0.0, 4.0)) in job.scene.effects
+    assert job.motion.num_frames == 4 and job.accuracy == "draft"
+    path.write_text('motion = "walk"\n[effects.gravity]\n[effects.stretch]\ncompression = 1\n')
+    assert load_scene(path).scene.effects == (Gravity(), Stretch(compression=1.0))
+    both = make_scene("walk", ["top", "bottom"])
+    assert [g.name for g in both.scene.garments] == ["bottom", "top"], "the innermost first"
+    assert LayerContact() in both.scene.effects
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("motion = ", "TOML"),
+        ("fps = 3.0", "no key motion"),
+        ('motion = "walk"\nwear = ["top"]', "unknown key wear"),
+        ('motion = "walk"\n[also.rain]', "no effect 'rain'"),
+        ('motion = "walk"\n[also.air]\nstorm = 1', "air has no 'storm'"),
+        ('motion = "walk"\naccuracy = "best"', "draft, standard, fine"),
+        ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = "tin"', "cotton"),
+        ('motion = "walk"\n[[garments]]\nname = "top"', "file and fabric"),
+    ],
+)
+def test_wrong_scene_files_are_refused_with_a_fix(tmp_path, text, says):
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=says):
+        load_scene(path)
+
+
+def test_a_stopped_rollout_goes_on_and_ends_the_same(tmp_path):
+    scene = prepare_scene(
+        Scene((square_sheet(5, pinned=np.arange(5)),), (Gravity(), Stretch(), Pin()))
+    )
+    motion = load_motion("balance", fps=10.0)
+    solver = XPBD(8, 2)
+    whole = simulate_batch(scene, [motion], solver=solver)[0]
+    seen = []
+
+    def stop(done, total):
+        seen.append(done)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    keep = tmp_path / "unfinished"
+    with pytest.raises(KeyboardInterrupt):
+        simulate_batch(scene, [motion], solver=solver, progress=stop, resume=keep)
+    assert len(list(keep.glob("block_*.npz"))) == 2
+    with pytest.raises(SimulationError, match="another scene"):
+        simulate_batch(scene, [motion], solver=XPBD(16, 2), resume=keep)
+    again = []
+    rest = simulate_batch(
+        scene, [motion], solver=solver, progress=lambda d, t: again.append(d), resume=keep
+    )[0]
+    assert again[0] > seen[-1], "what was done isn't done again"
+    np.testing.assert_array_equal(rest.positions[0], whole.positions[0])
+    np.testing.assert_array_equal(rest.diagnostics["speed_max"], whole.diagnostics["speed_max"])
+    assert not keep.exists()
+
+
+def test_the_price_list_tells_effects_that_matter_from_those_that_do_not(tmp_path, capsys):
+    # A sheet pinned to the hips a metre and a half before the body: no contact, little air.
+    g = square_sheet(5, pinned=np.arange(5))
+    motion = load_motion("balance", fps=30.0)
+    motion = dataclasses.replace(motion, rotations=motion.rotations[:10], root=motion.root[:10])
+    scene = Scene((g,), (Gravity(), Stretch(), BodyContact(), Pin()))
+    solver = XPBD(4, 1)
+    rows = price_effects(scene, motion, solver=solver)
+    by = {r.without: r for r in rows}
+    assert list(by) == ["", "Gravity", "Stretch", "BodyContact", "Pin"]
+    assert by[""].rms_mm == 0 and by["BodyContact"].rms_mm == 0
+    assert by["Gravity"].rms_mm > 10 and by["Pin"].rms_mm > 100
+    assert by["BodyContact"].mflop < by[""].mflop and by["Gravity"].mflop < by[""].mflop
+    assert by["Stretch"].strain_p99 > by[""].strain_p99
+    advice = {a.effect: a for a in recommend_effects(scene, motion, solver=solver, rows=rows)}
+    assert advice["Gravity"].needed and advice["Pin"].needed
+    assert not advice["BodyContact"].needed
+    assert not advice["SelfContact"].needed and "never comes nearer" in advice["SelfContact"].why
+
+
+def test_effects_prints_its_table(tmp_path, capsys):
+    path, rows = tmp_path / "scene.toml", tmp_path / "rows.json"
+    path.write_text(
+        'motion = "balance"\nframes = 2\naccuracy = "draft"\ngarments = ["bottom"]\n'
+        "[effects.gravity]\n[effects.body_contact]\n"
+    )
+    assert main(["effects", str(path), "--json", str(rows)]) == 0
+    said = capsys.readouterr().out
+    assert "BodyContact" in said and "inside" in said
+    data = json.loads(rows.read_text())["effects"]
+    assert [r["without"] for r in data] == ["", "Gravity", "BodyContact"]
+    assert data[2]["inside_share"] > data[0]["inside_share"]
+
+
+def test_without_blender_the_way_to_it_is_told(monkeypatch):
+    monkeypatch.setenv("PHYSXNET_BLENDER", "/nowhere/blender")
+    with pytest.raises(MissingDependencyError, match="PHYSXNET_BLENDER"):
+        find_blender()
