@@ -146,7 +146,7 @@ def test_effects_prints_its_table(tmp_path, capsys):
     assert "BodyContact" in said and "inside" in said
     data = json.loads(rows.read_text())["effects"]
     assert [r["without"] for r in data] == ["", "Gravity", "BodyContact"]
-    assert data[2]["inside_share"] > data[0]["inside_share"]
+    assert data[2]["mflop"] < data[0]["mflop"] and data[1]["rms_mm"] > 100
 
 
 def test_without_blender_the_way_to_it_is_told(monkeypatch):

@@ -160,15 +160,8 @@ def price(command: Effects, console: Console) -> int:
         caption="strain: 99th percentile; ms: a frame; Mflop: every loop's body once",
         title_justify="left",
     )
-    table.add_column("without")
-    for column in (
-        "rms (mm)",
-        "max (mm)",
-        "strain p99",
-        "inside",
-        "ms a frame",
-        "Mflop (loops once)",
-    ):
+    table.add_column("without", no_wrap=True)
+    for column in ("rms mm", "max mm", "strain", "inside", "ms", "Mflop"):
         table.add_column(column, justify="right")
     for r in rows:
         table.add_row(
