@@ -19,8 +19,8 @@ from ..geometry import (
 from ..motion import Motion, animate
 from ..simulation import Assembly
 
-# Skin farther than this from cloth has nothing to poke through [m].
-_UNDER = 0.05
+# Skin that wears cloth has it within this distance at rest [m].
+_UNDER = 0.08
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,8 +33,8 @@ class Penetration:
         depth: How deep [m], 0 outside, likewise.
         elsewhere: Of those inside, cloth that is outside the skin it is worn on: the
             body passes through itself there and no place is outside of both.
-        skin_outside: Share of the skin's vertices beneath cloth that stick out of its
-            triangles, shape [frames].
+        skin_outside: Share of the skin's vertices that wear cloth which stick out of
+            its triangles by more than 0.1 mm, shape [frames].
     """
 
     cloth_inside: Bool[np.ndarray, "frames vertices"]
@@ -85,6 +85,7 @@ def penetration(
     edges = mesh_edges(assembly.faces)
     rim[edges.vertices[edges.count == 1]] = True
     outwards = _outwards(assembly, home)
+    clothed = _clothed(assembly, home, rim, outwards, cloth_around)
     inside, depth, elsewhere, outside = [], [], [], []
     for k, x in zip(range(len(looked)), positions[looked]):
         s = skin[k]
@@ -98,7 +99,9 @@ def penetration(
         mine, _, _ = _height(x, s, normal, faces, around, _walk(x, s, around, faces, own))
         elsewhere.append(wrong & (mine >= 0))
         under = _nearest(x, s)
-        covered = np.flatnonzero(np.linalg.norm(x[under] - s, axis=1) < _UNDER)
+        # Only cloth that is worn on that skin: a hand beside the hip is no hole in it.
+        worn = np.linalg.norm(assembly.rest[under] - home, axis=1) < _UNDER
+        covered = np.flatnonzero(worn & clothed)
         cloth_normal = np.asarray(
             vertex_normals(jnp.asarray(x, jnp.float32), jnp.asarray(assembly.faces))
         )
@@ -122,6 +125,22 @@ def _outwards(assembly: Assembly, skin: Float[np.ndarray, "body 3"]) -> Float[np
     piece = connected_components(f, len(x))
     total = np.bincount(piece[f[:, 0]], away, minlength=piece.max() + 1)
     return np.where(total >= 0, 1.0, -1.0)[piece].astype(np.float32)
+
+
+def _clothed(
+    assembly: Assembly,
+    skin: Float[np.ndarray, "body 3"],
+    rim: Bool[np.ndarray, " vertices"],
+    outwards: Float[np.ndarray, " vertices"],
+    around: Int[np.ndarray, "vertices k"],
+) -> Bool[np.ndarray, " body"]:
+    """Skin that lies beneath cloth at rest, not beside its hem."""
+    x = assembly.rest.astype(np.float32)
+    normal = np.asarray(vertex_normals(jnp.asarray(x), jnp.asarray(assembly.faces)))
+    over = _nearest(x, skin)
+    up, weights, face = _height(skin, x, normal * outwards[:, None], assembly.faces, around, over)
+    beneath = (up < 0) & (up > -_UNDER)
+    return beneath & ((weights * ~rim[assembly.faces[face]]).sum(axis=1) > 0.05)
 
 
 def _nearest(

@@ -1,0 +1,327 @@
+"""Work against precision: what each solver's accuracy costs, on three scenes."""
+
+import dataclasses
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import MissingDependencyError, PhysXNetError
+from ..garment import Fabric, Garment, square_sheet, template
+from ..motion import Motion, load_motion
+from ..simulation import (
+    XPBD,
+    Bend,
+    BodyContact,
+    Damping,
+    Gravity,
+    Implicit,
+    Pin,
+    PreparedScene,
+    Rollout,
+    Scene,
+    Solver,
+    Stretch,
+    Verlet,
+    prepare_scene,
+    simulate_batch,
+    simulate_still,
+)
+from ..simulation.blender import BlenderSettings, simulate_blender
+from ._penetration import penetration
+from ._strain import edge_strain
+
+_FPS = 30.0
+_REPEATS = 3
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """One row of the table.
+
+    Attributes:
+        scene: ``sheet``, ``skirt`` or ``shirt``.
+        solver: Its name.
+        setting: What was varied.
+        rms_mm: Distance to the reference over vertices and frames [mm].
+        max_mm: Its maximum [mm].
+        penetration_share: Share of cloth vertices inside the body, all frames.
+        penetrating_frames: Frames with any such vertex.
+        skin_outside_share: Share of skin that sticks out of the cloth over it.
+        strain_p99: 99th percentile of the strain of edges.
+        ms_per_frame: Median time of warm runs [ms].
+        cold_s: What the first run took longer: compilation, mostly [s].
+        reference: What the error is measured against.
+        failed: Why there are no numbers; empty if there are.
+    """
+
+    scene: str
+    solver: str
+    setting: str
+    rms_mm: float
+    max_mm: float
+    penetration_share: float
+    penetrating_frames: int
+    skin_outside_share: float
+    strain_p99: float
+    ms_per_frame: float
+    cold_s: float
+    reference: str
+    failed: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class BenchScene:
+    """What is simulated.
+
+    Attributes:
+        name: Its name in the table.
+        scene: Garments and effects.
+        motion: The body's motion; None if it stands still.
+        frames: Frames that are compared.
+        reference: The solver that counts as the truth.
+        check: A finer or coarser one, to tell how far the truth can be trusted.
+    """
+
+    name: str
+    scene: Scene
+    motion: Motion | None
+    frames: int
+    reference: Solver
+    check: Solver
+
+
+_ACTING = (Gravity(), Damping(), Stretch(), Bend(), BodyContact(), Pin())
+
+
+def bench_scenes(
+    shirt: Garment | None = None, action: Motion | None = None, frames: int = 20
+) -> list[BenchScene]:
+    """The three scenes: a hanging sheet, a swinging skirt, a shirt on a punch.
+
+    Args:
+        shirt: The shirt; the template ``top`` if None.
+        action: What the person in it does; the built-in punch if None.
+        frames: Frames of the two worn scenes.
+    """
+    soft = Fabric(stretch=300.0, bend=2e-5)
+    sheet = square_sheet(17, 0.6, pinned=np.arange(17), fabric=soft)
+    free = (Gravity(), Stretch(compression=1.0), Bend(), Pin())
+
+    def first(m: Motion) -> Motion:
+        return dataclasses.replace(m, rotations=m.rotations[:frames], root=m.root[:frames])
+
+    punch = load_motion("punch", fps=_FPS) if action is None else action
+    shirt = template("top") if shirt is None else shirt
+    worn = (Verlet(2048, 8), Verlet(4096, 8))
+    return [
+        BenchScene("sheet", Scene((sheet,), free), None, 15, Verlet(2048, 1), Verlet(1024, 1)),
+        BenchScene(
+            "skirt",
+            Scene((template("dress"),), _ACTING),
+            first(load_motion("spin", fps=_FPS)),
+            frames,
+            *worn,
+        ),
+        BenchScene("shirt", Scene((shirt,), _ACTING), first(punch), frames, *worn),
+    ]
+
+
+def solvers(worn: bool) -> list[tuple[str, str, Solver]]:
+    """Name, setting and solver of every row that is ours."""
+    rows: list[tuple[str, str, Solver]] = []
+    for n in (8, 16, 32, 64, 128):
+        rows.append(("xpbd", f"{n} substeps", XPBD(n, max(1, n // 8) if worn else 1)))
+    for order, name in ((1, "backward euler"), (2, "bdf2")):
+        for n in (4, 8, 16):
+            rows.append((name, f"{n} substeps", Implicit(n, min(n, 4) if worn else 1, order=order)))
+    return rows
+
+
+def bench_simulation(
+    scenes: Sequence[BenchScene],
+    *,
+    blender: Sequence[int] = (),
+    done: Sequence[Work] = (),
+    progress: Callable[[str], None] | None = None,
+) -> Iterator[Work]:
+    """Measures every solver on every scene, row by row.
+
+    The rows of a scene: a cloth that only hangs where skinning puts it (it must be the
+    worst), our solvers, the reference against its check, the noise floor (the default
+    with its garment moved by 1e-6 m), and Blender against its own finest setting.
+
+    Args:
+        scenes: See `bench_scenes`.
+        blender: Qualities of Blender to run, the finest last; none if empty.
+        done: Rows that were measured before; they aren't again.
+        progress: Called with what is being measured.
+    """
+    have = {(r.scene, r.solver, r.setting) for r in done}
+
+    def tell(text: str) -> None:
+        if progress is not None:
+            progress(text)
+
+    for b in scenes:
+        prepared = prepare_scene(b.scene)
+        worn = b.motion is not None
+        ours = [s for s in solvers(worn) if (b.name, s[0], s[1]) not in have]
+        extras = [("nothing", ""), ("verlet float64", "check"), ("xpbd", "jitter 1e-6 m")]
+        extras = [e for e in extras if (b.name, *e) not in have]
+        named = "verlet float64"
+        if ours or extras:
+            tell(f"{b.name}: reference")
+            truth, truth_ms, _ = _timed(b, prepared, b.reference, repeats=1)
+        if ("nothing", "") in extras:
+            yield _row(b, prepared, "nothing", "", _still(b, prepared), truth, 0.0, 0.0, named)
+        for name, setting, solver in ours:
+            tell(f"{b.name}: {name}, {setting}")
+            yield _attempt(b, prepared, name, setting, solver, truth, named)
+            jax.clear_caches()
+        if ("verlet float64", "check") in extras:
+            tell(f"{b.name}: check of the reference")
+            x, ms, cold = _timed(b, prepared, b.check, repeats=1)
+            yield _row(b, prepared, "verlet float64", "check", x, truth, ms, cold, named)
+            jax.clear_caches()
+        if ("xpbd", "jitter 1e-6 m") in extras:
+            tell(f"{b.name}: noise floor")
+            base, ms, cold = _timed(b, prepared, XPBD(32, 4 if worn else 1), repeats=1)
+            moved = prepare_scene(dataclasses.replace(b.scene, garments=_jittered(b.scene)))
+            x, ms, _ = _timed(b, moved, XPBD(32, 4 if worn else 1), repeats=1)
+            yield _row(b, prepared, "xpbd", "jitter 1e-6 m", x, base, ms, cold, "xpbd, 32 substeps")
+            jax.clear_caches()
+        if worn and blender:
+            yield from _blender(b, prepared, blender, have, tell)
+
+
+def _attempt(
+    b: BenchScene,
+    prepared: PreparedScene,
+    name: str,
+    setting: str,
+    solver: Solver,
+    truth: Float[np.ndarray, "frames vertices 3"],
+    named: str,
+) -> Work:
+    try:
+        x, ms, cold = _timed(b, prepared, solver)
+        return _row(b, prepared, name, setting, x, truth, ms, cold, named)
+    except PhysXNetError as error:
+        return _failure(b.name, name, setting, str(error), named)
+
+
+def _failure(scene: str, name: str, setting: str, why: str, named: str) -> Work:
+    nan = float("nan")
+    return Work(scene, name, setting, nan, nan, nan, 0, nan, nan, nan, nan, named, why)
+
+
+def _run(b: BenchScene, prepared: PreparedScene, solver: Solver) -> tuple[Rollout, list[float]]:
+    ticks = [time.perf_counter()]
+    if b.motion is None:
+        out = simulate_still(prepared, b.frames, solver=solver, fps=_FPS)
+        ticks.append(time.perf_counter())
+        return out, [(ticks[1] - ticks[0]) / b.frames]
+    out = simulate_batch(
+        prepared, [b.motion], solver=solver, progress=lambda *_: ticks.append(time.perf_counter())
+    )[0]
+    return out, (np.diff(ticks) / 10).tolist()
+
+
+def _timed(
+    b: BenchScene, prepared: PreparedScene, solver: Solver, repeats: int = _REPEATS
+) -> tuple[Float[np.ndarray, "frames vertices 3"], float, float]:
+    """Positions, milliseconds a frame when warm, and what the first run took longer [s]."""
+    began = time.perf_counter()
+    out, laps = _run(b, prepared, solver)
+    first = time.perf_counter() - began
+    out.check()
+    warm = laps[1:]
+    if b.motion is None or repeats > 1:
+        began = time.perf_counter()
+        for _ in range(repeats if b.motion is None else 1):
+            warm = warm + _run(b, prepared, solver)[1]
+    typical = float(np.median(warm))
+    cold = first - typical * len(laps) * (b.frames if b.motion is None else 10)
+    return out.positions[0], 1e3 * typical, max(cold, 0.0)
+
+
+def _row(
+    b: BenchScene,
+    prepared: PreparedScene,
+    name: str,
+    setting: str,
+    x: Float[np.ndarray, "frames vertices 3"],
+    truth: Float[np.ndarray, "frames vertices 3"],
+    ms: float,
+    cold: float,
+    named: str,
+) -> Work:
+    gap = np.linalg.norm(np.asarray(x, np.float64) - truth, axis=2)
+    inside, frames, skin = 0.0, 0, 0.0
+    if b.motion is not None:
+        seen = penetration(prepared.assembly, b.motion, np.asarray(x, np.float32))
+        inside = float(seen.cloth_inside.mean())
+        frames = int(seen.cloth_inside.any(axis=1).sum())
+        skin = float(seen.skin_outside.mean())
+    return Work(
+        b.name,
+        name,
+        setting,
+        1e3 * float(np.sqrt((gap**2).mean())),
+        1e3 * float(gap.max()),
+        inside,
+        frames,
+        skin,
+        float(np.quantile(edge_strain(prepared.assembly, x), 0.99)),
+        ms,
+        cold,
+        named,
+    )
+
+
+def _still(b: BenchScene, prepared: PreparedScene) -> Float[np.ndarray, "frames vertices 3"]:
+    """What doing nothing gives: cloth that keeps its rest shape, somewhere."""
+    rest = prepared.assembly.rest.astype(np.float32)
+    return np.repeat(rest[None], b.frames, axis=0)
+
+
+def _jittered(scene: Scene) -> tuple[Garment, ...]:
+    rng = np.random.default_rng(0)
+
+    def one(g: Garment) -> Garment:
+        noise = 1e-6 * rng.normal(size=g.mesh.vertices.shape).astype(np.float32)
+        mesh = dataclasses.replace(g.mesh, vertices=g.mesh.vertices + noise)
+        return dataclasses.replace(g, mesh=mesh, offset=g.offset + noise)
+
+    return tuple(one(g) for g in scene.garments)
+
+
+def _blender(
+    b: BenchScene,
+    prepared: PreparedScene,
+    qualities: Sequence[int],
+    have: set[tuple[str, str, str]],
+    tell: Callable[[str], None],
+) -> Iterator[Work]:
+    """Blender at several qualities, each against the last one."""
+    named = f"blender, quality {qualities[-1]}"
+    if all((b.name, "blender", f"quality {q}") in have for q in qualities):
+        return
+    results: dict[int, Any] = {}
+    assert b.motion is not None
+    for q in qualities:
+        tell(f"{b.name}: blender, quality {q}")
+        try:
+            results[q] = simulate_blender(b.scene, b.motion, settings=BlenderSettings(quality=q))
+        except MissingDependencyError:
+            raise
+        except PhysXNetError as error:
+            yield _failure(b.name, "blender", f"quality {q}", str(error), named)
+    for q, out in results.items():
+        truth = results[qualities[-1]].positions[0]
+        ms = float(np.median(out.diagnostics["milliseconds"]))
+        yield _row(b, prepared, "blender", f"quality {q}", out.positions[0], truth, ms, 0.0, named)
