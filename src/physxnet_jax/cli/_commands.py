@@ -165,3 +165,33 @@ class Effects:
     """Print nothing but errors."""
     debug: bool = False
     """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Bench:
+    """What accuracy costs in time: every solver and setting against a reference.
+
+    Examples:
+      physxnet bench sim --out out/sim_bench.json
+      physxnet bench sim --scenes sheet
+      physxnet bench sim --blender 5 10 15 20 --shirt shirt.obj --motion punch.bvh
+    """
+
+    what: tyro.conf.Positional[Literal["sim"]]
+    """sim: the simulator."""
+    scenes: tuple[Literal["sheet", "skirt", "shirt"], ...] = ("sheet", "skirt", "shirt")
+    """A hanging sheet, a dress on a spin, a shirt on a punch."""
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Rows as JSON, with a table (.md) and a diagram (.png) beside it; goes on from there."""
+    frames: int = 20
+    """Frames of the scenes with a body."""
+    shirt: pathlib.Path | None = None
+    """An OBJ file instead of the template top."""
+    motion: str = "punch"
+    """What the person in the shirt does: a motion file or a built-in clip."""
+    blender: tuple[int, ...] = ()
+    """Qualities at which Blender runs too, the finest last."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""

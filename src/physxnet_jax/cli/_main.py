@@ -9,7 +9,7 @@ import tyro
 from rich.console import Console
 
 from ..errors import BrokenInstallError, PhysXNetError
-from ._commands import Clips, Demo, Doctor, Dress, Effects, Simulate, Stress
+from ._commands import Bench, Clips, Demo, Doctor, Dress, Effects, Simulate, Stress
 from ._doctor import doctor
 from ._progress import progress_bars
 
@@ -20,6 +20,7 @@ _Command = (
     | Annotated[Clips, tyro.conf.subcommand("clips")]
     | Annotated[Simulate, tyro.conf.subcommand("simulate")]
     | Annotated[Effects, tyro.conf.subcommand("effects")]
+    | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Stress, tyro.conf.subcommand("stress")]
 )
 
@@ -59,8 +60,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _run(
-    command: Dress | Demo | Doctor | Clips | Simulate | Effects | Stress, console: Console
+    command: Dress | Demo | Doctor | Clips | Simulate | Effects | Bench | Stress,
+    console: Console,
 ) -> int:
+    if isinstance(command, Bench):
+        from ._bench import bench
+
+        return bench(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Simulate | Effects):
         from ._simulate import price, simulate
 

@@ -1,6 +1,7 @@
 """What an effect is: an entry of a scene that leaves no trace when absent."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -72,6 +73,10 @@ class Prepared:
     def attached(self) -> Attached | None:
         """Points to be skinned for this effect, if it needs any."""
         return None
+
+    def rescaled(self, factors: Mapping[str, Any]) -> "Prepared":
+        """The effect with material parameters multiplied, see `System.rescaled`."""
+        return self
 
     def initial(self, batch: int) -> Any:
         """What the effect remembers before the first block (a pytree)."""

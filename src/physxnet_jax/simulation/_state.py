@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..body import Body, blend_rotations
+from ..errors import SimulationError
 from ..typing import pytree
 from ._effect import Attached, Placed, Prepared
 
@@ -48,6 +49,28 @@ class System:
     effects: tuple[Prepared, ...]
     inverse_mass: Float[Array, "vertices 1 1"]
     extra: Any = None
+
+    def rescaled(self, **factors: Float[Array, ""] | float) -> "System":
+        """The scene with other materials, differentiable by the factors.
+
+        Args:
+            **factors: What each parameter is multiplied by: ``stretch``, ``bend``
+                (stiffnesses), ``friction`` (on the skin).
+
+        Raises:
+            SimulationError: Another parameter.
+
+        Example:
+            ``jax.grad(lambda k: loss(system.rescaled(bend=k)))``
+        """
+        names = {"stretch", "bend", "friction"}
+        if set(factors) - names:
+            raise SimulationError(
+                f"No parameter {', '.join(sorted(set(factors) - names))}; there are"
+                f" {', '.join(sorted(names))}."
+            )
+        effects = tuple(e.rescaled(factors) for e in self.effects)
+        return dataclasses.replace(self, effects=effects)
 
 
 def place(

@@ -1,5 +1,6 @@
 """Looking at results: pictures and videos."""
 
+from ._diagram import draw_work_precision as draw_work_precision
 from ._render import (
     PREVIEWS as PREVIEWS,
     check_preview as check_preview,

@@ -1,6 +1,7 @@
 """Bending: quadratic isometric energy over hinges, flat at rest."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -64,6 +65,14 @@ class _Group:
 class _Bend(Prepared):
     elastic = True
     groups: tuple[_Group, ...]
+
+    def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
+        if "bend" not in factors:
+            return self
+        softer = [
+            dataclasses.replace(g, compliance=g.compliance / factors["bend"]) for g in self.groups
+        ]
+        return dataclasses.replace(self, groups=tuple(softer))
 
     def begin(
         self, base: Array, start: None, end: None, clock: Clock, memory: Any

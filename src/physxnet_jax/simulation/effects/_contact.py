@@ -1,6 +1,8 @@
 """Contact with the body: closest point on a local patch, Coulomb friction."""
 
 import dataclasses
+from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -233,6 +235,11 @@ class _Contact(Prepared):
     def attached(self) -> Attached:
         return self.skin
 
+    def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
+        if "friction" not in factors:
+            return self
+        return dataclasses.replace(self, friction=self.friction * factors["friction"])
+
     def initial(self, batch: int) -> Int[Array, "tight batch"]:
         return jnp.repeat(self.start[:, None], batch, axis=1)
 
@@ -264,7 +271,10 @@ class _Contact(Prepared):
         """Face and barycentric weights [3, some, batch] of the closest point on a patch."""
         batch = points.shape[2]
         # [patch, 3, some, batch], flat so that every gather is one of single numbers.
-        corner = self.corners[:, :, centre] * batch + jnp.arange(batch)[None, None, None]
+        corner = (
+            self.corners[:, :, centre] * batch
+            + jnp.arange(batch, dtype=jnp.int32)[None, None, None]
+        )
         flat = [skin[:, i].reshape(-1) for i in range(3)]
         tri = [jnp.stack([f[corner[:, k]] for f in flat]) for k in range(3)]
         p = jnp.broadcast_to(jnp.moveaxis(points, 1, 0)[:, None], tri[0].shape)

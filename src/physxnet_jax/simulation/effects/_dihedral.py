@@ -1,6 +1,7 @@
 """Dihedral bending: the angle between triangles, for large rotations and folds."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -39,6 +40,15 @@ class Dihedral(Effect):
 @dataclasses.dataclass(frozen=True)
 class _Dihedral(Coloured):
     groups: tuple[Group, ...]
+
+    def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
+        if "bend" not in factors:
+            return self
+        k = factors["bend"]
+        groups = [
+            dataclasses.replace(g, law={"compliance": g.law["compliance"] / k}) for g in self.groups
+        ]
+        return dataclasses.replace(self, groups=tuple(groups))
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
         def angle(x: tuple[Array, ...]) -> Constraint:

@@ -50,7 +50,7 @@ def closest_of(
     # [3, k, pairs, batch], flat so that every gather is one of single numbers.
     corner = jnp.moveaxis(patch, (3, 2), (0, 1))
     flat = [x[:, i].reshape(-1) for i in range(3)]
-    at = corner * batch + jnp.arange(batch)[None, None, None]
+    at = corner * batch + jnp.arange(batch, dtype=jnp.int32)[None, None, None]
     tri = [jnp.stack([f[at[k]] for f in flat]) for k in range(3)]
     p = jnp.broadcast_to(jnp.moveaxis(points, 1, 0)[:, None], tri[0].shape)
     weights, squared = closest_barycentric(p, *tri)

@@ -153,7 +153,7 @@ class _Self(Prepared):
         facing = jnp.sum(self.facing[other] * self.facing[:, None], axis=2) > 0
         beside = facing & (self.piece[other] == self.piece[:, None])
         ok &= ~beside | (jnp.sum(rest * rest, axis=2) > self.apart**2)
-        ok &= other != jnp.arange(count)[:, None]
+        ok &= other != jnp.arange(count, dtype=jnp.int32)[:, None]
         ok &= self.part[other] == self.part[:, None]
         ok &= squared < (2.0 * cell) ** 2
         normal = self.normals(x)

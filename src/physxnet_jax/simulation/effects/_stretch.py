@@ -1,6 +1,7 @@
 """Stretch: edges resist a change of length, less so when compressed."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -80,6 +81,13 @@ class _Stretch(Prepared):
     elastic = True
     groups: tuple[_Group, ...]
     softer: float = dataclasses.field(metadata={"static": True})
+
+    def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
+        if "stretch" not in factors:
+            return self
+        k = factors["stretch"]
+        groups = [dataclasses.replace(g, compliance=g.compliance / k) for g in self.groups]
+        return dataclasses.replace(self, groups=tuple(groups))
 
     def begin(
         self, base: Array, start: None, end: None, clock: Clock, memory: Any

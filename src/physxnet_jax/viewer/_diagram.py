@@ -1,0 +1,58 @@
+"""Work-precision diagrams."""
+
+import pathlib
+from collections.abc import Mapping, Sequence
+
+from ..errors import MissingDependencyError
+from ..files import whole_file
+
+
+def draw_work_precision(
+    path: str | pathlib.Path,
+    points: Sequence[tuple[str, str, float, float]],
+    floors: Mapping[str, float],
+) -> pathlib.Path:
+    """Error against time, a panel for each scene, both axes logarithmic.
+
+    Args:
+        path: A PNG file.
+        points: Scene, method, error [mm] and time [ms a frame]; those of a method are
+            joined in the order given.
+        floors: Noise floor of a scene [mm]; a point below it is drawn hollow.
+
+    Raises:
+        MissingDependencyError: matplotlib isn't installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Diagrams need matplotlib: pip install 'physxnet-jax[render]'."
+        ) from error
+    scenes = list(dict.fromkeys(p[0] for p in points))
+    figure = Figure(figsize=(4.6 * max(len(scenes), 1), 4.0), layout="constrained")
+    FigureCanvasAgg(figure)
+    methods = list(dict.fromkeys(p[1] for p in points))
+    for k, scene in enumerate(scenes):
+        axes = figure.add_subplot(1, len(scenes), k + 1)
+        for m, method in enumerate(methods):
+            mine = [(e, t) for s, n, e, t in points if (s, n) == (scene, method) and e > 0]
+            if not mine:
+                continue
+            error, time = zip(*mine, strict=True)
+            colour = f"C{m}"
+            axes.plot(time, error, "-", color=colour, label=method)
+            for e, t in zip(error, time, strict=True):
+                below = e < floors.get(scene, 0.0)
+                axes.plot([t], [e], "o", color=colour, mfc="white" if below else colour)
+        if scene in floors:
+            axes.axhline(floors[scene], color="grey", ls=":", lw=1, label="noise floor")
+        axes.set(xscale="log", yscale="log", title=scene, xlabel="time [ms a frame]")
+        axes.set_ylabel("error, rms [mm]")
+        axes.grid(True, which="major", alpha=0.3)
+        axes.legend(fontsize=7)
+    path = pathlib.Path(path)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=120, format="png")
+    return path
