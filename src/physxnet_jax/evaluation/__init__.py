@@ -1,11 +1,13 @@
 """Metrics and reports: what an answer is worth, and what holds where it is hard."""
 
+from . import _stress_worn as _stress_worn  # its cases join the others
 from ._bench import (
     JITTER as JITTER,
     BenchScene as BenchScene,
     Work as Work,
     bench_scenes as bench_scenes,
     bench_simulation as bench_simulation,
+    solvers as solvers,
     time_to_error as time_to_error,
 )
 from ._metrics import VertexError as VertexError, vertex_error as vertex_error

@@ -146,6 +146,7 @@ def solvers(worn: bool) -> list[tuple[str, str, Solver]]:
 def bench_simulation(
     scenes: Sequence[BenchScene],
     *,
+    methods: Sequence[tuple[str, str, Solver]] | None = None,
     blender: Sequence[int] = (),
     done: Sequence[Work] = (),
     progress: Callable[[str], None] | None = None,
@@ -158,6 +159,7 @@ def bench_simulation(
 
     Args:
         scenes: See `bench_scenes`.
+        methods: Name, setting and solver of our rows; `solvers` if None.
         blender: Qualities of Blender to run, the finest last; none if empty.
         done: Rows that were measured before; they aren't again.
         progress: Called with what is being measured.
@@ -171,7 +173,8 @@ def bench_simulation(
     for b in scenes:
         prepared = prepare_scene(b.scene)
         worn = b.motion is not None
-        ours = [s for s in solvers(worn) if (b.name, s[0], s[1]) not in have]
+        every = solvers(worn) if methods is None else methods
+        ours = [s for s in every if (b.name, s[0], s[1]) not in have]
         extras = [("nothing", ""), ("verlet float64", "check"), ("xpbd", JITTER)]
         extras = [e for e in extras if (b.name, *e) not in have]
         named = "verlet float64"

@@ -1,0 +1,57 @@
+"""Penetration measured on meshes: right at rest, and it sees what was pushed in."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from physxnet_jax.body import NUM_BODY_VERTICES
+from physxnet_jax.evaluation import edge_strain, penetration
+from physxnet_jax.garment import template
+from physxnet_jax.geometry import vertex_normals
+from physxnet_jax.motion import Motion
+from physxnet_jax.simulation import Gravity, Scene, prepare_scene
+
+
+@pytest.fixture(scope="module")
+def standing(body, rest):
+    root = body.joint_positions(rest)[0][:1]
+    return Motion(body.a_pose()[None], root, 30.0)
+
+
+@pytest.mark.parametrize("name", ["top", "bottom"])
+def test_clothes_at_rest_are_outside_and_sunk_ones_inside(body, rest, standing, name):
+    assembly = prepare_scene(Scene((template(name),), (Gravity(),))).assembly
+    x = assembly.rest[None].astype(np.float32)
+    seen = penetration(assembly, standing, x)
+    assert seen.cloth_inside.mean() == 0 and seen.skin_outside[0] == 0
+    # A patch that lies on the skin, pushed inwards by 15 mm, ends up about 10 mm deep.
+    near = KDTree(assembly.rest_body[:NUM_BODY_VERTICES]).query(assembly.rest)[0]
+    centre = assembly.rest[near.argmin()]
+    front = np.flatnonzero(np.linalg.norm(assembly.rest - centre, axis=1) < 0.04)
+    pushed = x.copy()
+    n = np.asarray(vertex_normals(jnp.asarray(x[0]), jnp.asarray(assembly.faces)))
+    pushed[0, front] -= 0.015 * n[front]
+    seen = penetration(assembly, standing, pushed)
+    assert seen.cloth_inside[0, front].mean() > 0.8
+    assert not np.delete(seen.cloth_inside[0], front).any()
+    assert 0.005 < seen.depth.max() < 0.015
+    assert not seen.elsewhere.any(), "inside the skin it is worn on"
+    assert seen.skin_outside[0] > 0, "and the skin there sticks out"
+
+
+def test_strain_is_that_of_a_scaled_garment():
+    assembly = prepare_scene(Scene((template("bottom"),), (Gravity(),))).assembly
+    x = np.stack([assembly.rest, 1.1 * assembly.rest])
+    strain = edge_strain(assembly, x)
+    np.testing.assert_allclose(strain[0], 0.0, atol=1e-12)
+    np.testing.assert_allclose(strain[1], 0.1, rtol=1e-9)
+
+
+def test_frames_can_be_chosen(standing):
+    assembly = prepare_scene(Scene((template("bottom"),), (Gravity(),))).assembly
+    motion = Motion(
+        jnp.repeat(standing.rotations, 3, axis=0), jnp.repeat(standing.root, 3, axis=0), 30.0
+    )
+    x = np.repeat(assembly.rest[None].astype(np.float32), 3, axis=0)
+    assert penetration(assembly, motion, x, frames=np.asarray([0, 2])).depth.shape[0] == 2
