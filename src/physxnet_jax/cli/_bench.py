@@ -50,7 +50,7 @@ def bench(command: Bench, console: Console) -> int:
         draw_work_precision(
             command.out.with_suffix(".png"),
             [
-                (r.scene, r.solver, r.rms_mm, r.ms_per_frame)
+                (r.scene, _label(r), r.rms_mm, r.ms_per_frame)
                 for r in rows
                 if not r.failed and r.ms_per_frame > 0 and r.setting not in ("check", JITTER)
             ],
@@ -58,6 +58,10 @@ def bench(command: Bench, console: Console) -> int:
         )
         console.print(f"wrote {command.out}, .md and .png", highlight=False)
     return 0
+
+
+def _label(r: Work) -> str:
+    return r.solver if r.reference.startswith("verlet") else f"{r.solver} (against itself)"
 
 
 def _write(path: pathlib.Path, rows: list[Work]) -> None:

@@ -26,6 +26,7 @@ def draw_work_precision(
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
+        from matplotlib.ticker import NullFormatter
     except ImportError as error:
         raise MissingDependencyError(
             "Diagrams need matplotlib: pip install 'physxnet-jax[render]'."
@@ -49,6 +50,7 @@ def draw_work_precision(
         if scene in floors:
             axes.axhline(floors[scene], color="grey", ls=":", lw=1, label="noise floor")
         axes.set(xscale="log", yscale="log", title=scene, xlabel="time [ms a frame]")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylabel("error, rms [mm]")
         axes.grid(True, which="major", alpha=0.3)
         axes.legend(fontsize=7)

@@ -10,7 +10,6 @@ import struct
 import sys
 import time
 
-import bpy  # pyright: ignore[reportMissingImports]
 import numpy as np
 
 # One frame of Blender's cloth lasts this long [s], whatever the scene's frame rate.
@@ -31,6 +30,8 @@ def write_pc2(path, positions):
 
 def add_mesh(name, vertices, faces, cache):
     """A mesh that a point cache moves; frame 1 is the cache's first."""
+    import bpy  # pyright: ignore[reportMissingImports]
+
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(vertices.tolist(), [], faces.tolist())
     thing = bpy.data.objects.new(name, mesh)
@@ -45,6 +46,8 @@ def add_mesh(name, vertices, faces, cache):
 
 def main():
     """Builds the scene, steps through every frame in order, keeps what the cloth does."""
+    import bpy  # pyright: ignore[reportMissingImports]
+
     folder = pathlib.Path(sys.argv[-1])
     data = np.load(folder / "scene.npz")
     wanted = json.loads((folder / "settings.json").read_text())
@@ -109,4 +112,5 @@ def main():
     np.savez(folder / "cloth.npz", positions=back, milliseconds=taken)
 
 
-main()
+if __name__ == "__main__":
+    main()
