@@ -1,7 +1,6 @@
 """Contact between garments worn in layers, in a stated order."""
 
 import dataclasses
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +14,7 @@ from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, Prepared
 from ._limbs import adjoining, limb_labels
-from ._pairs import Pairs, closest_of, foot_of, keep_apart, rows_of, side_normal
+from ._pairs import ClothContact, Facing, Pairs, closest_of, foot_of, rows_of, side_normal
 
 # Layers farther apart than this at rest never meet [m].
 _REACH = 0.25
@@ -117,7 +116,7 @@ def _nearest(
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _Layers(Prepared):
+class _Layers(ClothContact):
     rows: Int[Array, " pairs"]
     start: Int[Array, " pairs"]
     side: Float[Array, "pairs 1 1"]
@@ -133,12 +132,7 @@ class _Layers(Prepared):
     def initial(self, batch: int) -> Int[Array, "pairs batch"]:
         return jnp.repeat(self.start[:, None], batch, axis=1)
 
-    def keep(self, context: tuple[Array, Pairs, Clock]) -> Array:
-        return context[0]
-
-    def begin(
-        self, base: Array, start: None, end: None, clock: Clock, memory: Array
-    ) -> tuple[Array, Pairs, Clock]:
+    def begin(self, base: Array, start: None, end: None, clock: Clock, memory: Array) -> Facing:
         x = jax.lax.stop_gradient(base)
         points = x[self.rows]
         at = memory
@@ -160,40 +154,12 @@ class _Layers(Prepared):
         vertex = jnp.repeat(self.rows[:, None], base.shape[2], axis=1)
         # Against the true positions, so that the height has a derivative.
         height = jnp.sum((base[self.rows] - foot_of(base, corners, weights)) * n, axis=1)[:, None]
-        return (
-            at,
-            Pairs(vertex, corners, weights, n, height, active.astype(base.dtype)),
-            clock,
-        )
+        pairs = Pairs(vertex, corners, weights, n, height, active.astype(base.dtype))
+        return Facing(pairs, clock, at)
 
-    def project(
-        self,
-        displacement: Array,
-        start: Array,
-        context: tuple[Array, Pairs, Clock],
-        progress: Array,
-        step: tuple[float, float],
-    ) -> Array:
-        _, pairs, clock = context
-        law = self.law
-        return keep_apart(
-            displacement,
-            start,
-            pairs,
-            self.inverse_mass,
-            law.gap,
-            law.friction,
-            law.leave,
-            clock,
-            progress,
-        )
-
-    def diagnose(self, displacement: Array, context: Any) -> dict[str, Array]:
-        _, pairs, _ = context
-        index = [pairs.vertex, *pairs.corners]
-        share = [jnp.ones_like(pairs.weights[0]), *(-pairs.weights)]
-        gone = sum(s[:, None] * rows_of(displacement, i) for i, s in zip(index, share, strict=True))
-        height = (pairs.height + jnp.sum(gone * pairs.normal, axis=1, keepdims=True))[:, 0]
+    def diagnose(self, displacement: Array, context: Facing) -> dict[str, Array]:
+        pairs = context.pairs
+        height = pairs.heights(displacement)[:, 0]
         wrong = (height < 0) & (pairs.active[:, 0] > 0)
         return {
             "layers_crossed": jnp.sum(wrong, axis=0),

@@ -1,14 +1,14 @@
 """Cloth against cloth: vertices that face triangles, kept apart and rubbing."""
 
 import dataclasses
+from typing import Any, Protocol, runtime_checkable
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...geometry import closest_barycentric
 from ...typing import pytree
-from .._effect import Clock
+from .._effect import Clock, Prepared
 
 
 @pytree
@@ -31,6 +31,70 @@ class Pairs:
     normal: Float[Array, "pairs 3 batch"]
     height: Float[Array, "pairs 1 batch"]
     active: Float[Array, "pairs 1 batch"]
+
+    def members(self) -> tuple[list[Array], list[Array]]:
+        """Rows of the vertex and the three corners, and their shares in the distance."""
+        shares = [jnp.ones_like(self.weights[0]), *(-self.weights)]
+        return [self.vertex, *self.corners], shares
+
+    def parted(self, displacement: Float[Array, "vertices 3 batch"]) -> Array:
+        """How vertices have moved against their points [m], shape [pairs, 3, batch]."""
+        index, share = self.members()
+        return sum(s[:, None] * rows_of(displacement, i) for i, s in zip(index, share, strict=True))  # pyright: ignore[reportReturnType]
+
+    def heights(self, displacement: Float[Array, "vertices 3 batch"]) -> Array:
+        """Heights after these displacements [m], shape [pairs, 1, batch]."""
+        return self.height + jnp.sum(self.parted(displacement) * self.normal, axis=1, keepdims=True)
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class Facing:
+    """What cloth contact knows in a block.
+
+    Attributes:
+        pairs: Who faces whom.
+        clock: The block.
+        kept: For the next block.
+    """
+
+    pairs: Pairs
+    clock: Clock
+    kept: Any
+
+
+@runtime_checkable
+class Spacing(Protocol):
+    """How far cloth keeps from cloth: gap [m], friction [1], speed of recovery [m/s]."""
+
+    @property
+    def gap(self) -> float: ...
+    @property
+    def friction(self) -> float: ...
+    @property
+    def leave(self) -> float: ...
+
+
+class ClothContact(Prepared):
+    """What contact of cloth with cloth shares: say in `begin` who faces whom."""
+
+    inverse_mass: Float[Array, "vertices 1 1"]
+    law: Spacing
+
+    def keep(self, context: Facing) -> Any:
+        return context.kept
+
+    def project(
+        self,
+        displacement: Array,
+        start: Array,
+        context: Facing,
+        progress: Array,
+        step: tuple[float, float],
+    ) -> Array:
+        return keep_apart(
+            displacement, start, context.pairs, self.inverse_mass, self.law, context.clock, progress
+        )
 
 
 def rows_of(x: Float[Array, "vertices 3 batch"], index: Int[Array, "... batch"]) -> Array:
@@ -69,9 +133,7 @@ def keep_apart(
     start: Float[Array, "vertices 3 batch"],
     pairs: Pairs,
     inverse_mass: Float[Array, "vertices 1 1"],
-    gap: float,
-    friction: float,
-    leave: float,
+    law: Spacing,
     clock: Clock,
     progress: Array,
 ) -> Array:
@@ -86,32 +148,24 @@ def keep_apart(
         start: At the substep's start [m].
         pairs: The pairs of this block.
         inverse_mass: [1/kg].
-        gap: Distance kept [m].
-        friction: Coulomb coefficient between the layers [1].
-        leave: Speed of recovery [m/s].
+        law: Gap, friction and speed of recovery.
         clock: The block.
         progress: Share of the block done.
     """
     lane = jnp.arange(displacement.shape[2])[None]
-    index = [pairs.vertex, *pairs.corners]
-    share = [jnp.ones_like(pairs.weights[0]), *(-pairs.weights)]
-    rows = [rows_of(displacement, i) for i in index]
+    index, share = pairs.members()
     mass = [inverse_mass[i, 0, 0][:, None] for i in index]
-
-    def between(r: list[Array]) -> Array:
-        return sum(s[:, None] * x for s, x in zip(share, r, strict=True))  # pyright: ignore[reportReturnType]
-
     n = pairs.normal
-    gone = between(rows)
-    height = pairs.height + jnp.sum(gone * n, axis=1, keepdims=True)
-    wanted = jnp.minimum(gap, pairs.height + leave * progress * clock.length)
+    gone = pairs.parted(displacement)
+    height = pairs.heights(displacement)
+    wanted = jnp.minimum(law.gap, pairs.height + law.leave * progress * clock.length)
     depth = jnp.maximum(wanted - height, 0.0) * pairs.active
     inertia = sum(s[:, None] ** 2 * w for s, w in zip(share, mass, strict=True))
     lift = depth / (inertia + 1e-9)
-    slide = gone - between([rows_of(start, i) for i in index])
+    slide = gone - pairs.parted(start)
     slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
     length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
-    hold = jnp.minimum(1.0, friction * depth / length) / (inertia + 1e-9)
+    hold = jnp.minimum(1.0, law.friction * depth / length) / (inertia + 1e-9)
     move = lift * n - jnp.where(depth > 0, hold, 0.0) * slide
     total = jnp.zeros_like(displacement)
     count = jnp.zeros_like(displacement[:, :1])
@@ -128,8 +182,3 @@ def side_normal(x: Float[Array, "vertices 3 batch"], corners: Int[Array, "3 pair
     a, b, c = (rows_of(x, i) for i in corners)
     n = jnp.cross(b - a, c - a, axis=1)
     return n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-20)
-
-
-def frozen(pairs: Pairs) -> Pairs:
-    """Pairs as constants: who faces whom has no derivative."""
-    return jax.tree.map(jax.lax.stop_gradient, pairs)

@@ -11,7 +11,7 @@ from ...geometry import connected_components, mesh_edges, vertex_faces
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Clock, Effect, Prepared
-from ._pairs import Pairs, closest_of, foot_of, keep_apart, rows_of, side_normal
+from ._pairs import ClothContact, Facing, Pairs, closest_of, foot_of, side_normal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ class SelfContact(Effect):
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _Self(Prepared):
+class _Self(ClothContact):
     rest: Float[Array, "vertices 3"]
     facing: Float[Array, "vertices 3"]
     piece: Int[Array, " vertices"]
@@ -91,20 +91,14 @@ class _Self(Prepared):
         none = jnp.full((2, count, batch), -1, jnp.int32)
         return jnp.zeros((), jnp.int32), none, jnp.zeros(batch, jnp.int32)
 
-    def keep(self, context: tuple[Pairs, Clock, tuple]) -> tuple[Array, Array, Array]:
-        blocks, near, crowd = context[2]
-        return (blocks + 1) % self.law.every, near, crowd
-
-    def begin(
-        self, base: Array, start: None, end: None, clock: Clock, memory: tuple
-    ) -> tuple[Pairs, Clock, tuple]:
+    def begin(self, base: Array, start: None, end: None, clock: Clock, memory: tuple) -> Facing:
         x = jax.lax.stop_gradient(base)
         batch = base.shape[2]
         search = jax.vmap(self.nearest, in_axes=2, out_axes=(2, 0))
         near, crowd = jax.lax.cond(
             memory[0] == 0, lambda: search(x), lambda: (memory[1], memory[2])
         )
-        found_now = memory[0], near, crowd
+        kept = (memory[0] + 1) % self.law.every, near, crowd
         # [2 vertices, batch]: in front of the cloth, then behind it.
         near = near.reshape(-1, batch)
         own = jnp.arange(base.shape[0], dtype=near.dtype)
@@ -118,7 +112,7 @@ class _Self(Prepared):
         both = jnp.concatenate([base, base])
         height = jnp.sum((both - foot_of(base, corners, weights)) * n, axis=1, keepdims=True)
         active = (found & (length < self.reach)).astype(base.dtype)
-        return Pairs(vertex, corners, weights, n, height, active), clock, found_now
+        return Facing(Pairs(vertex, corners, weights, n, height, active), clock, kept)
 
     def nearest(self, x: Float[Array, "vertices 3"]) -> tuple[Int[Array, "2 vertices"], Array]:
         """The nearest vertex on either side of the cloth, -1 for none, and the overflow."""
@@ -172,33 +166,8 @@ class _Self(Prepared):
         n = jnp.cross(b - a, c - a)
         return jnp.zeros_like(x).at[self.faces.reshape(-1)].add(jnp.repeat(n, 3, axis=0))
 
-    def project(
-        self,
-        displacement: Array,
-        start: Array,
-        context: tuple[Pairs, Clock, tuple],
-        progress: Array,
-        step: tuple[float, float],
-    ) -> Array:
-        pairs, clock, _ = context
-        law = self.law
-        return keep_apart(
-            displacement,
-            start,
-            pairs,
-            self.inverse_mass,
-            law.gap,
-            law.friction,
-            law.leave,
-            clock,
-            progress,
-        )
-
-    def diagnose(self, displacement: Array, context: tuple[Pairs, Clock, tuple]) -> dict:
-        pairs, _, crowd = context
-        index = [pairs.vertex, *pairs.corners]
-        share = [jnp.ones_like(pairs.weights[0]), *(-pairs.weights)]
-        gone = sum(s[:, None] * rows_of(displacement, i) for i, s in zip(index, share, strict=True))
-        height = pairs.height + jnp.sum(gone * pairs.normal, axis=1, keepdims=True)
+    def diagnose(self, displacement: Array, context: Facing) -> dict[str, Array]:
+        pairs = context.pairs
+        height = pairs.heights(displacement)
         gap = jnp.where(pairs.active > 0, height, jnp.inf)
-        return {"self_gap": gap.min(axis=(0, 1)), "overflow": crowd[2]}
+        return {"self_gap": gap.min(axis=(0, 1)), "overflow": context.kept[2]}
