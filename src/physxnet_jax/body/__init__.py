@@ -17,3 +17,12 @@ from ._kinematics import (
     forward_kinematics as forward_kinematics,
     linear_blend_skinning as linear_blend_skinning,
 )
+from ._segments import (
+    CALVES as CALVES,
+    FOREARMS as FOREARMS,
+    HANDS as HANDS,
+    THIGHS as THIGHS,
+    TRUNK as TRUNK,
+    UPPER_ARMS as UPPER_ARMS,
+    body_segments as body_segments,
+)

@@ -36,6 +36,7 @@ def bench(command: Bench, console: Console) -> int:
         for row in bench_simulation(
             scenes,
             blender=command.blender,
+            newton=command.newton,
             done=tuple(rows),
             progress=lambda text: status.update(text),
         ):
@@ -90,6 +91,7 @@ _COLUMNS = (
     "rms mm",
     "max mm",
     "inside",
+    "pinched",
     "bad frames",
     "strain",
     "ms/frame",
@@ -99,13 +101,14 @@ _COLUMNS = (
 
 def _cells(r: Work) -> list[str]:
     if r.failed:
-        return [r.solver, r.setting, "failed", r.failed, *[""] * 4, r.reference]
+        return [r.solver, r.setting, "failed", r.failed, *[""] * 5, r.reference]
     return [
         r.solver,
         r.setting,
         f"{r.rms_mm:.3g}",
         f"{r.max_mm:.3g}",
         f"{100 * r.penetration_share:.2f} %",
+        f"{100 * r.pinched_share:.2f} %",
         str(r.penetrating_frames),
         f"{r.strain_p99:.3f}",
         f"{r.ms_per_frame:.1f}",

@@ -130,8 +130,9 @@ class Simulate:
     """Frames a second."""
     frames: int | None = None
     """Stop after this many frames."""
-    engine: Literal["xpbd", "bdf2", "blender"] = "xpbd"
-    """bdf2: implicit, second order. blender: out of process (see PHYSXNET_BLENDER)."""
+    engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
+    """bdf2: implicit, second order. blender: out of process (see PHYSXNET_BLENDER).
+    newton: likewise (PHYSXNET_NEWTON)."""
     body: bool = True
     """Put the body into the result."""
     quiet: bool = False
@@ -175,6 +176,7 @@ class Bench:
       physxnet bench sim --out out/sim_bench.json
       physxnet bench sim --scenes sheet
       physxnet bench sim --blender 5 10 15 20 --shirt shirt.obj --motion punch.bvh
+      physxnet bench sim --newton 5 10 20
     """
 
     what: tyro.conf.Positional[Literal["sim"]]
@@ -191,6 +193,8 @@ class Bench:
     """What the person in the shirt does: a motion file or a built-in clip."""
     blender: tuple[int, ...] = ()
     """Qualities at which Blender runs too, the finest last."""
+    newton: tuple[int, ...] = ()
+    """Substeps at which Newton runs too, likewise."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False

@@ -27,6 +27,7 @@ from ..simulation import (
     simulate_batch,
 )
 from ..simulation.blender import simulate_blender
+from ..simulation.newton import simulate_newton
 from ..viewer import check_preview, render_preview
 from ._commands import Effects, Simulate
 from ._progress import progress_bars
@@ -69,8 +70,9 @@ def simulate(command: Simulate, console: Console) -> int:
         def progress(done: int, total: int) -> None:
             bars("simulation", done, total)
 
-        if command.engine == "blender":
-            rollout = simulate_blender(scene, job.motion, progress=progress)
+        if command.engine in ("blender", "newton"):
+            run = simulate_blender if command.engine == "blender" else simulate_newton
+            rollout = run(scene, job.motion, progress=progress)
         else:
             solver = Implicit(16, 4) if command.engine == "bdf2" else ACCURACY[accuracy]
             rollout = simulate_batch(

@@ -1,9 +1,9 @@
 """Work against precision: what each solver's accuracy costs, on three scenes."""
 
 import dataclasses
+import functools
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import jax
 import numpy as np
@@ -31,6 +31,7 @@ from ..simulation import (
     simulate_still,
 )
 from ..simulation.blender import BlenderSettings, simulate_blender
+from ..simulation.newton import NewtonSettings, simulate_newton
 from ._penetration import penetration
 from ._strain import edge_strain
 
@@ -50,8 +51,10 @@ class Work:
         setting: Substeps a frame, or what else was varied.
         rms_mm: Distance to the reference over vertices and frames [mm].
         max_mm: Its maximum [mm].
-        penetration_share: Share of cloth vertices inside the body, all frames.
-        penetrating_frames: Frames with any such vertex.
+        penetration_share: Share of cloth vertices inside the body where there is room
+            above their skin, all frames (see `Penetration`).
+        pinched_share: Share of those inside where the body leaves no room.
+        penetrating_frames: Frames with any of the former.
         skin_outside_share: Share of skin that sticks out of the cloth over it.
         strain_p99: 99th percentile of the strain of edges.
         ms_per_frame: Median time of warm runs [ms].
@@ -66,6 +69,7 @@ class Work:
     rms_mm: float
     max_mm: float
     penetration_share: float
+    pinched_share: float
     penetrating_frames: int
     skin_outside_share: float
     strain_p99: float
@@ -148,6 +152,7 @@ def bench_simulation(
     *,
     methods: Sequence[tuple[str, str, Solver]] | None = None,
     blender: Sequence[int] = (),
+    newton: Sequence[int] = (),
     done: Sequence[Work] = (),
     progress: Callable[[str], None] | None = None,
 ) -> Iterator[Work]:
@@ -155,12 +160,14 @@ def bench_simulation(
 
     The rows of a scene: a cloth that only hangs where skinning puts it (it must be the
     worst), our solvers, the reference against its check, the noise floor (the default
-    with its garment moved by 1e-6 m), and Blender against its own finest setting.
+    with its garment moved by 1e-6 m), and Blender and Newton against their own
+    finest settings.
 
     Args:
         scenes: See `bench_scenes`.
         methods: Name, setting and solver of our rows; `solvers` if None.
         blender: Qualities of Blender to run, the finest last; none if empty.
+        newton: Substeps of Newton to run, likewise.
         done: Rows that were measured before; they aren't again.
         progress: Called with what is being measured.
     """
@@ -199,8 +206,23 @@ def bench_simulation(
             x, ms, _ = _timed(b, moved, XPBD(32, 4 if worn else 1), repeats=1)
             yield _row(b, prepared, "xpbd", JITTER, x, base, ms, cold, "xpbd, 32 substeps")
             jax.clear_caches()
-        if worn and blender:
-            yield from _blender(b, prepared, blender, have, tell)
+        if worn:
+            peers: dict[str, dict[str, Callable[[Motion], Rollout]]] = {
+                "blender": {
+                    f"quality {q}": functools.partial(
+                        simulate_blender, b.scene, settings=BlenderSettings(quality=q)
+                    )
+                    for q in blender
+                },
+                "newton": {
+                    f"{n} substeps": functools.partial(
+                        simulate_newton, b.scene, settings=NewtonSettings(substeps=n)
+                    )
+                    for n in newton
+                },
+            }
+            for name, runs in peers.items():
+                yield from _peer(b, prepared, name, runs, have, tell)
 
 
 def _attempt(
@@ -221,7 +243,7 @@ def _attempt(
 
 def _failure(scene: str, name: str, setting: str, why: str, named: str) -> Work:
     nan = float("nan")
-    return Work(scene, name, setting, nan, nan, nan, 0, nan, nan, nan, nan, named, why)
+    return Work(scene, name, setting, nan, nan, nan, nan, 0, nan, nan, nan, nan, named, why)
 
 
 def _run(b: BenchScene, prepared: PreparedScene, solver: Solver) -> tuple[Rollout, list[float]]:
@@ -266,11 +288,12 @@ def _row(
     named: str,
 ) -> Work:
     gap = np.linalg.norm(np.asarray(x, np.float64) - truth, axis=2)
-    inside, frames, skin = 0.0, 0, 0.0
+    inside, pinched, frames, skin = 0.0, 0.0, 0, 0.0
     if b.motion is not None:
         seen = penetration(prepared.assembly, b.motion, np.asarray(x, np.float32))
-        inside = float(seen.cloth_inside.mean())
-        frames = int(seen.cloth_inside.any(axis=1).sum())
+        wrong = seen.cloth_inside & ~seen.pinched
+        inside, pinched = float(wrong.mean()), float(seen.pinched.mean())
+        frames = int(wrong.any(axis=1).sum())
         skin = float(seen.skin_outside.mean())
     return Work(
         b.name,
@@ -279,6 +302,7 @@ def _row(
         1e3 * float(np.sqrt((gap**2).mean())),
         1e3 * float(gap.max()),
         inside,
+        pinched,
         frames,
         skin,
         float(np.quantile(edge_strain(prepared.assembly, x), 0.99)),
@@ -305,31 +329,34 @@ def _jittered(scene: Scene) -> tuple[Garment, ...]:
     return tuple(one(g) for g in scene.garments)
 
 
-def _blender(
+def _peer(
     b: BenchScene,
     prepared: PreparedScene,
-    qualities: Sequence[int],
+    name: str,
+    runs: Mapping[str, Callable[[Motion], Rollout]],
     have: set[tuple[str, str, str]],
     tell: Callable[[str], None],
 ) -> Iterator[Work]:
-    """Blender at several qualities, each against the last one."""
-    named = f"blender, quality {qualities[-1]}"
-    if all((b.name, "blender", f"quality {q}") in have for q in qualities):
+    """Another simulator at several settings, each against the last one."""
+    if all((b.name, name, setting) in have for setting in runs):
         return
-    results: dict[int, Any] = {}
+    named = f"{name}, {list(runs)[-1]}"
+    results: dict[str, Rollout] = {}
     assert b.motion is not None
-    for q in qualities:
-        tell(f"{b.name}: blender, quality {q}")
+    for setting, run in runs.items():
+        tell(f"{b.name}: {name}, {setting}")
         try:
-            results[q] = simulate_blender(b.scene, b.motion, settings=BlenderSettings(quality=q))
+            results[setting] = run(b.motion)
         except MissingDependencyError:
             raise
         except PhysXNetError as error:
-            yield _failure(b.name, "blender", f"quality {q}", str(error), named)
-    for q, out in results.items():
-        truth = results[qualities[-1]].positions[0]
-        ms = float(np.median(out.diagnostics["milliseconds"]))
-        yield _row(b, prepared, "blender", f"quality {q}", out.positions[0], truth, ms, 0.0, named)
+            yield _failure(b.name, name, setting, str(error), named)
+    if named.removeprefix(f"{name}, ") not in results:
+        return
+    truth = results[list(runs)[-1]].positions[0]
+    for setting, out in results.items():
+        ms = float(np.median(out.diagnostics["milliseconds"][1:]))
+        yield _row(b, prepared, name, setting, out.positions[0], truth, ms, 0.0, named)
 
 
 def time_to_error(rows: Sequence[Work], limit_mm: float) -> Work | None:

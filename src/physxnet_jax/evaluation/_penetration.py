@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
-from ..body import NUM_BODY_VERTICES, triangulate
+from ..body import NUM_BODY_VERTICES, body_segments, triangulate
 from ..geometry import (
+    cast_rays,
     closest_barycentric,
     connected_components,
+    make_mesh,
     mesh_edges,
     vertex_faces,
     vertex_normals,
@@ -21,6 +23,14 @@ from ..simulation import Assembly
 
 # Skin that wears cloth has it within this distance at rest [m].
 _UNDER = 0.08
+# Room that skin in the open has above it [m].
+_THIN = 0.005
+# Cloth above skin by this much or less covers it [m].
+_FOLD = 0.03
+# There is room for cloth where other skin is no nearer than this share of its thickness.
+_CLEAR = 0.7
+# Skin rises this little above the tangent plane of a vertex next to it [m].
+_CURVED = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,18 +38,21 @@ class Penetration:
     """What is on the wrong side, frame by frame.
 
     Attributes:
-        cloth_inside: Cloth vertices inside the skin nearest to them, shape
+        cloth_inside: Cloth vertices inside the nearest skin or inside any limb, shape
             [frames, vertices].
-        depth: How deep [m], 0 outside, likewise.
-        elsewhere: Of those inside, cloth that is outside the skin it is worn on: the
-            body passes through itself there and no place is outside of both.
+        depth: How deep below the nearest skin or the limb's [m], 0 outside, likewise.
+        pinched: Of those inside, cloth with no room above the skin it is worn on: one
+            thickness above, other skin is nearer than that, or the place lies within
+            another limb. The body folds or passes through itself there.
         skin_outside: Share of the skin's vertices that wear cloth which stick out of
-            its triangles by more than 0.1 mm, shape [frames].
+            its nearest triangle by more than 0.1 mm and have none above within 3 cm,
+            shape [frames]. Skin in a fold or within another limb, with no room for cloth
+            above it, isn't counted.
     """
 
     cloth_inside: Bool[np.ndarray, "frames vertices"]
     depth: Float[np.ndarray, "frames vertices"]
-    elsewhere: Bool[np.ndarray, "frames vertices"]
+    pinched: Bool[np.ndarray, "frames vertices"]
     skin_outside: Float[np.ndarray, " frames"]
 
 
@@ -52,8 +65,9 @@ def penetration(
 ) -> Penetration:
     """Measures penetration without asking the simulator that made the cloth.
 
-    The nearest skin vertex is found among all, the closest point among the triangles
-    around it and its neighbours, the sign by the interpolated normal there.
+    The nearest skin vertex is found among all, and among those of each segment of the
+    body; the closest point among the triangles around it, the sign by the interpolated
+    normal there. A segment's own open ends have no sign.
 
     Args:
         assembly: The scene's garments and body.
@@ -81,23 +95,43 @@ def penetration(
     cloth_around = vertex_faces(assembly.faces, len(assembly.rest))
     home = assembly.rest_body[:NUM_BODY_VERTICES]
     own = _nearest(home, assembly.rest)
+    limbs = _limbs(assembly, faces)
+    segment = body_segments(np.asarray(body.weights)[:NUM_BODY_VERTICES], body)
     rim = np.zeros(len(assembly.rest), bool)
     edges = mesh_edges(assembly.faces)
     rim[edges.vertices[edges.count == 1]] = True
     outwards = _outwards(assembly, home)
     clothed = _clothed(assembly, home, rim, outwards, cloth_around)
-    inside, depth, elsewhere, outside = [], [], [], []
+    inside, depth, pinched, outside = [], [], [], []
     for k, x in zip(range(len(looked)), positions[looked]):
         s = skin[k]
         normal = np.asarray(vertex_normals(jnp.asarray(s), jnp.asarray(faces)))
         near = _nearest(s, x)
         height, _, _ = _height(x, s, normal, faces, around, near)
-        wrong = height < 0
+        lowest = np.minimum(height, _in_limbs(x, s, normal, limbs))
+        wrong = lowest < 0
         inside.append(wrong)
-        depth.append(np.where(wrong, -height, 0.0))
-        # On its own limb: from the nearest skin vertex at rest.
-        mine, _, _ = _height(x, s, normal, faces, around, _walk(x, s, around, faces, own))
-        elsewhere.append(wrong & (mine >= 0))
+        depth.append(np.where(wrong, -lowest, 0.0))
+        # Where it is worn: from the nearest skin vertex at rest, over the surface.
+        at = _walk(x, s, around, faces, own)
+        _, weights, face = _height(x, s, normal, faces, around, at)
+        foot, up = (np.einsum("pk,pki->pi", weights, a[faces[face]]) for a in (s, normal))
+
+        def crowded(
+            foot: np.ndarray,
+            up: np.ndarray,
+            room: np.ndarray,
+            at: np.ndarray,
+            s: np.ndarray = s,
+            normal: np.ndarray = normal,
+        ) -> np.ndarray:
+            """Whether there is no place at this height above skin."""
+            above = foot + room[:, None] * up
+            clear, _, _ = _height(above, s, normal, faces, around, _nearest(s, above))
+            crossed = _in_limbs(above, s, normal, limbs, but=segment[at]) < 0
+            return crossed | (clear < _CLEAR * room)
+
+        pinched.append(wrong & crowded(foot, up, assembly.thickness, at))
         under = _nearest(x, s)
         # Only cloth that is worn on that skin: a hand beside the hip is no hole in it.
         worn = np.linalg.norm(assembly.rest[under] - home, axis=1) < _UNDER
@@ -112,8 +146,68 @@ def penetration(
         # A foot on the hem is beside the cloth, not beneath it.
         beside = ((weights * rim[assembly.faces[face]]).sum(axis=1)) > 0.999
         sticks = (up > 1e-4) & ~beside
-        outside.append(sticks.sum() / max(len(covered), 1))
-    return Penetration(np.stack(inside), np.stack(depth), np.stack(elsewhere), np.asarray(outside))
+        bare = covered[sticks]
+        seen = ~crowded(s[bare], normal[bare], np.full(len(bare), _THIN), bare)
+        seen &= ~_under_cloth(s[bare], normal[bare], x, assembly.faces)
+        outside.append(seen.sum() / max(len(covered), 1))
+    return Penetration(np.stack(inside), np.stack(depth), np.stack(pinched), np.asarray(outside))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Limb:
+    segment: int
+    vertices: Int[np.ndarray, " mine"]
+    faces: Int[np.ndarray, "faces 3"]
+    around: Int[np.ndarray, "body k"]
+    rim: Bool[np.ndarray, " body"]
+    thick: float
+
+
+def _limbs(assembly: Assembly, faces: Int[np.ndarray, "faces 3"]) -> list[_Limb]:
+    """The skin's segments as meshes of their own, open where they were joined."""
+    body = assembly.body
+    segment = body_segments(np.asarray(body.weights)[:NUM_BODY_VERTICES], body)
+    out = []
+    for k in np.unique(segment):
+        mine = faces[(segment[faces] == k).all(axis=1)]
+        edges = mesh_edges(mine)
+        rim = np.zeros(NUM_BODY_VERTICES, bool)
+        rim[edges.vertices[edges.count == 1]] = True
+        around = vertex_faces(mine, NUM_BODY_VERTICES)
+        vertices = np.unique(mine)
+        # No point of a limb lies deeper than half its least width.
+        x = assembly.rest_body[vertices]
+        axes = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2]
+        width = np.ptp(x @ axes.T, axis=0)[2]
+        out.append(_Limb(int(k), vertices, mine, around, rim, 0.5 * float(width)))
+    return out
+
+
+def _in_limbs(
+    x: Float[np.ndarray, "points 3"],
+    s: Float[np.ndarray, "body 3"],
+    normal: Float[np.ndarray, "body 3"],
+    limbs: list[_Limb],
+    *,
+    but: Int[np.ndarray, " points"] | None = None,
+) -> Float[np.ndarray, " points"]:
+    """Least height over any limb's skin, at most 0; not over the segment ``but``."""
+    out = np.zeros(len(x))
+    for limb in limbs:
+        near = limb.vertices[_nearest(s[limb.vertices], x)]
+        gap = x - s[near]
+        close = np.einsum("pi,pi->p", gap, gap) < limb.thick**2
+        # Only points beneath the nearest vertex's plane, or nearly, can be inside.
+        close &= np.einsum("pi,pi->p", gap, normal[near]) < _CURVED
+        if but is not None:
+            close &= but != limb.segment
+        rows = np.flatnonzero(close)
+        if not len(rows):
+            continue
+        height, weights, face = _height(x[rows], s, normal, limb.faces, limb.around, near[rows])
+        at_end = (weights * limb.rim[limb.faces[face]]).sum(axis=1) > 0.999
+        out[rows] = np.minimum(out[rows], np.where(at_end, 0.0, height))
+    return out
 
 
 def _outwards(assembly: Assembly, skin: Float[np.ndarray, "body 3"]) -> Float[np.ndarray, " v"]:
@@ -165,6 +259,25 @@ def _walk(
             break
         at = best
     return at
+
+
+def _under_cloth(
+    points: Float[np.ndarray, "points 3"],
+    directions: Float[np.ndarray, "points 3"],
+    cloth: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+) -> Bool[np.ndarray, " points"]:
+    """Whether a ray along each skin normal meets cloth, as under a fold that hangs over."""
+    rows = 1 << int(np.ceil(np.log2(max(len(points), 64))))
+    pad = ((0, rows - len(points)), (0, 0))
+    mesh = make_mesh(np.asarray(cloth, np.float32), faces)
+    hits = cast_rays(
+        mesh,
+        jnp.asarray(np.pad(points, pad), jnp.float32),
+        jnp.asarray(np.pad(directions, pad), jnp.float32),
+        max_distance=_FOLD,
+    )
+    return np.asarray(hits.valid)[: len(points)]
 
 
 def _height(

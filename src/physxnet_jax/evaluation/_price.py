@@ -207,7 +207,7 @@ def _measure(
             1e3 * float(np.sqrt((gap**2).mean())),
             1e3 * float(gap.max()),
             float(np.quantile(edge_strain(prepared.assembly, x), 0.99)),
-            float(inside.cloth_inside.mean()),
+            float((inside.cloth_inside & ~inside.pinched).mean()),
             1e3 * float(np.median(laps[1:] if len(laps) > 1 else laps)) / 10,
             flops / 1e6,
             float(laps[0]),

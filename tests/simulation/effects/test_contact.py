@@ -118,3 +118,40 @@ def test_cloth_follows_its_own_skin_across_a_sharp_fold(body, rest):
     )
     gap = np.linalg.norm(out.positions[0][-1] - calm.positions[0][0], axis=1)
     assert np.median(gap) < 0.01
+
+
+def test_limbs_share_the_room_between_them(body, rest):
+    """An arm pressed into the trunk: the cloth of both lies in the middle of the overlap."""
+    scene = prepare_scene(Scene((template("top"),), (BodyContact(),)))
+    contact = scene.effects[0]
+    pinch = contact.pinch
+    calm = pinch.room(_placed(contact.attached))[:, 0]
+    # The control: with the arms away from the body nothing is pinched.
+    assert calm.min() > 0.0
+    pose = np.asarray(body.a_pose()).copy()
+    joint = body.joint("LeftArm")
+    # 60 degrees about the forward axis: from the A-pose well into the flank.
+    for angle in (60.0, -60.0):
+        half = np.radians(angle) / 2
+        turned = pose.copy()
+        turned[joint] = [np.cos(half), 0.0, 0.0, np.sin(half)]
+        heads = body.joint_positions(rest)[0]
+        motion = Motion(jnp.asarray(turned[None], jnp.float32), heads[:1], FPS, "pressed")
+        skin = contact.attached
+        points = animate(body, rest, skin.rest, skin.weights, motion)[0]
+        along = animate(body, rest, skin.rest + 1e-3 * skin.normals, skin.weights, motion)[0]
+        normals = 1e3 * (along - points)
+        placed = dataclasses.replace(
+            _placed(skin), points=points[..., None], normals=normals[..., None]
+        )
+        room = pinch.room(placed)[:, 0]
+        if room.min() < -0.02:
+            break
+    else:
+        pytest.fail("the arm wasn't pressed into the trunk either way")
+    out = simulate(
+        Scene((template("top"),)),
+        Motion(jnp.repeat(motion.rotations, 4, 0), jnp.repeat(motion.root, 4, 0), FPS, "held"),
+    )
+    assert (out.diagnostics["pinched"] > 10).all()
+    assert out.diagnostics["strain_p99"].max() < 0.5

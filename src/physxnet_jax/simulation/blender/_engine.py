@@ -1,23 +1,15 @@
 """Hands a scene to Blender and takes back the cloth."""
 
 import dataclasses
-import json
 import os
 import pathlib
-import re
 import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable
 
-import numpy as np
-
-from ...body import NUM_BODY_VERTICES, triangulate
-from ...errors import MissingDependencyError, SimulationError
-from ...motion import Motion, animate
-from .._assembly import float32
+from ...errors import MissingDependencyError
+from ...motion import Motion
 from .._diagnostics import Rollout
-from .._rollout import lead_in
+from .._outside import simulate_outside
 from .._scene import Scene, prepare_scene
 
 _SCRIPT = pathlib.Path(__file__).with_name("_script.py")
@@ -101,61 +93,12 @@ def simulate_blender(
         SimulationError: Blender failed; its last words are given.
     """
     settings = BlenderSettings() if settings is None else settings
-    command = find_blender()
     scene = dataclasses.replace(scene, effects=())
-    assembly = prepare_scene(scene).assembly
-    body = assembly.body
-    rest = float32(assembly.rest_body)
-    lead = lead_in(body, motion)
-    skipped = lead.num_frames - 1
-    every = Motion(
-        np.concatenate([lead.rotations, motion.rotations[1:]]),  # pyright: ignore[reportArgumentType]
-        np.concatenate([lead.root, motion.root[1:]]),  # pyright: ignore[reportArgumentType]
-        motion.fps,
+    return simulate_outside(
+        "Blender",
+        find_blender(),
+        prepare_scene(scene),
+        motion,
+        dataclasses.asdict(settings),
+        progress,
     )
-    skin = animate(body, rest, rest[:NUM_BODY_VERTICES], body.weights[:NUM_BODY_VERTICES], every)
-    cloth = animate(body, rest, float32(assembly.rest), float32(assembly.weights), every)
-    arrays: dict[str, np.ndarray] = {
-        "skin": np.asarray(skin, np.float32),
-        "skin_faces": np.asarray(triangulate(body.quads)),
-        "parts": np.asarray(assembly.parts),
-        "cloth": np.asarray(cloth, np.float32),
-        "cloth_rest": assembly.rest.astype(np.float32),
-        "cloth_faces": assembly.faces,
-        "pinned": assembly.pinned,
-        "fps": np.asarray(motion.fps),
-    }
-    total = every.num_frames
-    with tempfile.TemporaryDirectory(prefix="physxnet_blender_") as name:
-        folder = pathlib.Path(name)
-        np.savez(folder / "scene.npz", allow_pickle=False, **arrays)
-        (folder / "settings.json").write_text(json.dumps(dataclasses.asdict(settings)))
-        said: list[str] = []
-        with subprocess.Popen(
-            [*command, str(folder)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-        ) as process:
-            assert process.stdout is not None
-            for line in process.stdout:
-                said.append(line.rstrip())
-                done = re.match(r"frame (\d+)", line)
-                if done and progress is not None:
-                    progress(int(done.group(1)), total)
-        result = folder / "cloth.npz"
-        if process.returncode != 0 or not result.is_file():
-            raise SimulationError(
-                f"Blender ended with code {process.returncode}: {' | '.join(said[-5:])}"
-            )
-        with np.load(result) as data:
-            positions, taken = data["positions"], data["milliseconds"]
-    positions = positions[skipped:]
-    speed = np.zeros(positions.shape[:2])
-    speed[1:] = np.linalg.norm(np.diff(positions, axis=0), axis=2) * motion.fps
-    diagnostics = {
-        "finite": np.isfinite(positions).all(axis=(1, 2)),
-        "speed_max": speed.max(axis=1),
-        "worst_vertex": speed.argmax(axis=1),
-        "residual_p99": np.zeros(len(positions)),
-        "milliseconds": taken[skipped:],
-    }
-    pieces = tuple(positions[:, i:j] for i, j in zip(assembly.parts, assembly.parts[1:]))
-    return Rollout(pieces, motion.fps, diagnostics, motion.name)

@@ -16,6 +16,7 @@ from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Attached, Clock, Effect, Placed, Prepared
 from ._limbs import LOWER_ARMS, TRUNK, UPPER_ARMS, limb_labels
+from ._pinch import ROOM, Pinch, prepare_pinch
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,8 +30,10 @@ class BodyContact(Effect):
     Cloth that lies on the skin *tracks* it: the search starts at the skin point of the
     block before and walks over the surface, so the cloth may slide any distance but never
     jumps to the far side of a limb, to another limb, or across a fold where the body
-    passes through itself. Cloth pinched between two limbs keeps to its own, and is
-    counted (``pinched``). Hanging cloth compares a list of patches over all limbs within
+    passes through itself. Between two limbs that come closer than twice its thickness,
+    tracking cloth keeps half of the room there is: where the body passes through itself
+    the cloth of both limbs lies midway, as if the flesh had given way, and is counted
+    (``pinched``). Hanging cloth compares a list of patches over all limbs within
     reach instead.
 
     Attributes:
@@ -41,7 +44,8 @@ class BodyContact(Effect):
         spacing: Distance between them [m].
         push: Largest correction in one substep [m].
         leave: Cloth that was lifted leaves the skin no faster than this [m/s]: what was
-            squeezed into a limb is set down outside instead of being shot away.
+            squeezed into a limb is set down outside instead of being shot away. Nor does
+            another limb press it onto its own faster.
 
     References:
         Macklin et al. (2016) for the projection; friction as a clamped tangential
@@ -103,19 +107,18 @@ class BodyContact(Effect):
             float32(assembly.thickness[:, None]),
             float32(assembly.friction[:, None]),
             float32((w > 0)[:, None]),
-            *_others(assembly, skin, used, label),
+            prepare_pinch(skin[used], np.asarray(attached.normals), weights[used], body),
+            jnp.asarray(assembly.loose[:, None]),
             self.push,
             self.leave,
             self.hops,
         )
 
 
-# Of other limbs only skin farther than this at rest can pinch [m].
-_APART = 0.06
-# Nor skin farther above than this [m].
-_DEEP = 0.10
-# Distance between the samples of the skin that pinching is looked for at [m].
-_SAMPLE = 0.03
+# Room where nothing limits it [m].
+_FREE = 10.0
+# Above the middle of a pinch, so that skin beside it stays covered [m].
+_COVER = 0.002
 # Cloth this little above its thickness touches the skin [m].
 _NEAR = 0.001
 # Skin farther than this from all cloth at rest takes no part [m].
@@ -163,22 +166,6 @@ def _limbs(weights: Float[np.ndarray, "points joints"], body: Body) -> Int[np.nd
     return label
 
 
-def _others(
-    assembly: Assembly,
-    skin: Float[np.ndarray, "body 3"],
-    used: Int[np.ndarray, " used"],
-    label: Int[np.ndarray, " body"],
-) -> tuple[Int[Array, " samples"], Bool[Array, "vertices samples"]]:
-    """Samples of the skin, and which belong to another limb than a cloth vertex."""
-    pool = np.asarray(spread_points(skin[used], _SAMPLE))
-    cloth = _limbs(assembly.weights, assembly.body)
-    other = cloth[:, None] != label[used[pool]][None]
-    near = KDTree(skin[used[pool]]).query_ball_point(assembly.rest, _APART)
-    for v, mine in enumerate(near):
-        other[v, mine] = False
-    return jnp.asarray(pool.astype(np.int32)), jnp.asarray(other & ~assembly.loose[:, None])
-
-
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Touch:
@@ -190,11 +177,14 @@ class _Touch:
         normal: The skin's normal there at the start, not unit.
         turn: How it changes in the block.
         centre: Skin vertices to start from in the next block.
+        room: Of the skin at the end, see `Pinch.room`.
         missed: The point lies beyond its patch.
         unit: The normal at the start, unit.
         ceiling: Fastest that touching cloth may leave [m/s].
-        base: Cloth at the start [m].
-        limbs: Samples of the skin at the end, and their normals.
+        height: Wanted above the skin at the start [m].
+        rise: How that changes in the block [m].
+        top: Allowed above the skin at the start [m]: the other limb is beyond.
+        fall: How that changes in the block [m].
     """
 
     where: Float[Array, "vertices 3 batch"]
@@ -202,11 +192,14 @@ class _Touch:
     normal: Float[Array, "vertices 3 batch"]
     turn: Float[Array, "vertices 3 batch"]
     centre: Int[Array, "tight batch"]
+    room: Float[Array, "skin batch"]
     missed: Bool[Array, "vertices batch"]
     unit: Float[Array, "vertices 3 batch"]
     ceiling: Float[Array, "vertices 1 batch"]
-    base: Float[Array, "vertices 3 batch"]
-    limbs: tuple[Float[Array, "samples 3 batch"], Float[Array, "samples 3 batch"]]
+    height: Float[Array, "vertices 1 batch"]
+    rise: Float[Array, "vertices 1 batch"]
+    top: Float[Array, "vertices 1 batch"]
+    fall: Float[Array, "vertices 1 batch"]
 
 
 @pytree
@@ -225,8 +218,8 @@ class _Contact(Prepared):
     thickness: Float[Array, "vertices 1"]
     friction: Float[Array, "vertices 1"]
     free: Float[Array, "vertices 1"]
-    samples: Int[Array, " samples"]
-    others: Bool[Array, "vertices samples"]
+    pinch: Pinch
+    hanging: Bool[Array, "vertices 1"]
     push: float = dataclasses.field(metadata={"static": True})
     leave: float = dataclasses.field(metadata={"static": True})
     hops: int = dataclasses.field(metadata={"static": True})
@@ -240,11 +233,12 @@ class _Contact(Prepared):
             return self
         return dataclasses.replace(self, friction=self.friction * factors["friction"])
 
-    def initial(self, batch: int) -> Int[Array, "tight batch"]:
-        return jnp.repeat(self.start[:, None], batch, axis=1)
+    def initial(self, batch: int) -> tuple[Array, Array]:
+        room = jnp.full((self.skin.rest.shape[0], batch), ROOM, self.skin.rest.dtype)
+        return jnp.repeat(self.start[:, None], batch, axis=1), room
 
-    def keep(self, context: _Touch) -> Array:
-        return context.centre
+    def keep(self, context: _Touch) -> tuple[Array, Array]:
+        return context.centre, context.room
 
     def walk(
         self,
@@ -284,10 +278,18 @@ class _Contact(Prepared):
         weights = jnp.take_along_axis(weights, best[None, None], axis=1)[:, 0]
         return jax.lax.stop_gradient(face), weights
 
-    def begin(self, base: Array, start: Placed, end: Placed, clock: Clock, memory: Array) -> _Touch:
+    def begin(
+        self,
+        base: Array,
+        start: Placed,
+        end: Placed,
+        clock: Clock,
+        memory: tuple[Array, Array],
+    ) -> _Touch:
         stop = jax.lax.stop_gradient
         points = stop(start.points)
-        centre = self.walk(stop(base[self.tight]), points, memory)
+        centre, room = memory
+        centre = self.walk(stop(base[self.tight]), points, centre)
         last = centre
         if self.loose.shape[0]:
             loose = stop(base[self.loose])
@@ -304,12 +306,31 @@ class _Contact(Prepared):
         from_middle = p0 - jnp.moveaxis(start.points[last, :, lane], -1, 1)
         far = jnp.sum(from_middle**2, axis=1) > self.radius[last] ** 2
         unit = n0 / jnp.sqrt(jnp.sum(n0 * n0, axis=1, keepdims=True) + 1e-12)
+        later = self.pinch.room(end)
+        wanted, top = self._between(room, face, weights)
+        rise, fall = self._between(later, face, weights)
         height = jnp.sum((base - p0) * unit, axis=1, keepdims=True)
-        touching = height < self.thickness[..., None] + _NEAR
+        touching = height < wanted + _NEAR
         fastest = jnp.sum((p1 - p0) * unit, axis=1, keepdims=True) / clock.length + self.leave
         ceiling = jnp.where(touching, fastest, jnp.inf)
-        limbs = end.points[self.samples], end.normals[self.samples]
-        return _Touch(p0 - base, p1 - p0, n0, n1 - n0, centre, far, unit, ceiling, base, limbs)
+        heights = wanted, rise - wanted, top, fall - top
+        return _Touch(p0 - base, p1 - p0, n0, n1 - n0, centre, later, far, unit, ceiling, *heights)
+
+    def _between(self, room: Array, face: Array, weights: Array) -> tuple[Array, Array]:
+        """Least and largest height above the skin [m], the same where limbs leave no room."""
+        lane = jnp.arange(room.shape[1])[None]
+        tri = self.faces[face]
+        there = jnp.sum(
+            jnp.stack([weights[k] * room[tri[..., k], lane] for k in range(3)]), axis=0
+        )[:, None]
+        # Grows without bound, and smoothly, towards what counts as no pinch.
+        there = there / jnp.maximum(1.0 - (jnp.maximum(there, 0.0) / ROOM) ** 2, ROOM / _FREE)
+        there = jnp.where(self.hanging[..., None], _FREE, there)
+        thickness = self.thickness[..., None]
+        # Layers keep their order: the outermost lies in the middle.
+        outermost = self.thickness.max()
+        low = jnp.minimum(thickness, 0.5 * there + _COVER - (outermost - thickness))
+        return low, jnp.maximum(there - outermost, low)
 
     def accelerate(self, velocity: Array, context: _Touch, h: float) -> Array:
         unit, ceiling = context.unit, context.ceiling
@@ -324,50 +345,39 @@ class _Contact(Prepared):
         progress: Array,
         step: tuple[float, float],
     ) -> Array:
-        n, depth = self._depth(displacement, context, progress)
-        lift = jnp.clip(depth, 0.0, self.push) * self.free[..., None]
+        n, height = self._height(displacement, context, progress)
+        low = context.height + progress * context.rise
+        high = context.top + progress * context.fall
+        slowest = -self.leave * step[0]
+        lift = jnp.clip(jnp.clip(height, low, high) - height, slowest, self.push)
+        lift = lift * self.free[..., None]
         moved = displacement + lift * n
         # Friction acts against the skin's own way in this substep.
         slide = (moved - start) - step[1] * context.way
         slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
         length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
-        hold = jnp.minimum(1.0, self.friction[..., None] * lift / length)
+        hold = jnp.minimum(1.0, self.friction[..., None] * jnp.abs(lift) / length)
         return moved - hold * slide
 
-    def _depth(self, displacement: Array, context: _Touch, progress: Array) -> tuple[Array, Array]:
-        """Unit normals, and how much of the thickness is missing [m]."""
+    def _height(self, displacement: Array, context: _Touch, progress: Array) -> tuple[Array, Array]:
+        """Unit normals, and heights above the skin [m]."""
         n = context.normal + progress * context.turn
         n = n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-12)
         gap = displacement - (context.where + progress * context.way)
-        height = jnp.sum(gap * n, axis=1, keepdims=True)
-        return n, self.thickness[..., None] - height
+        return n, jnp.sum(gap * n, axis=1, keepdims=True)
 
     def diagnose(self, displacement: Array, context: _Touch) -> dict[str, Array]:
-        depth = self._depth(displacement, context, jnp.ones((), displacement.dtype))[1]
-        inside = depth[:, 0] - self.thickness
+        height = self._height(displacement, context, jnp.ones((), displacement.dtype))[1]
+        # Below the skin; in a pinch, a thickness below its middle.
+        wanted = context.height + context.rise
+        inside = (wanted - self.thickness[..., None] - height)[:, 0]
         return {
             "penetration_max": jnp.maximum(inside.max(axis=0), 0.0),
             "inside_share": jnp.mean((inside > 0).astype(displacement.dtype), axis=0),
             # Far from the skin it doesn't matter which point is the closest.
             "missed": jnp.sum(context.missed & (inside > -0.02), axis=0),
-            "pinched": self._pinched(displacement, context),
+            "pinched": jnp.sum(wanted[:, 0] < 0, axis=0),
         }
-
-    def _pinched(self, displacement: Array, context: _Touch) -> Array:
-        """Vertices that lie within another limb than their own."""
-        points, normals = context.limbs
-        x = context.base + displacement
-        product = jnp.einsum("vib,sib->vsb", x, points)
-        squared = jnp.sum(points**2, axis=1)[None] - 2.0 * product
-        squared = jnp.where(self.others[..., None], squared, jnp.inf)
-        nearest = jnp.argmin(squared, axis=1)
-        lane = jnp.arange(x.shape[2])[None]
-        gap = x - jnp.moveaxis(points[nearest, :, lane], -1, 1)
-        height = jnp.sum(gap * jnp.moveaxis(normals[nearest, :, lane], -1, 1), axis=1)
-        # Only where the sample stands for the skin right above.
-        beside = jnp.sum(gap * gap, axis=1) - height**2
-        inside = (height < 0) & (height > -_DEEP) & (beside < _SAMPLE**2)
-        return jnp.sum(inside & jnp.any(self.others, axis=1)[:, None], axis=0)
 
 
 def _surface(skin: Placed, faces: Array, face: Array, weights: Array) -> tuple[Array, Array]:

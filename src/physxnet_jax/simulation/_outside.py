@@ -1,0 +1,98 @@
+"""Hands a scene to a simulator in a process of its own and takes back the cloth."""
+
+import json
+import pathlib
+import re
+import subprocess
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..body import NUM_BODY_VERTICES, triangulate
+from ..errors import SimulationError
+from ..motion import Motion, animate
+from ._assembly import float32
+from ._diagnostics import Rollout
+from ._rollout import lead_in
+from ._scene import PreparedScene
+
+
+def simulate_outside(
+    name: str,
+    command: Sequence[str],
+    scene: PreparedScene,
+    motion: Motion,
+    settings: Mapping[str, Any],
+    progress: Callable[[int, int], None] | None,
+) -> Rollout:
+    """Runs ``command FOLDER`` on ``scene.npz`` and ``settings.json``; reads ``cloth.npz``.
+
+    Args:
+        name: What the simulator is called in errors.
+        command: Prints ``frame N`` after every frame and ends with code 0.
+        scene: Garments and body.
+        motion: The body's motion; the lead-in that `simulate` has is put before it.
+        settings: Written as JSON.
+        progress: Called with frames done and frames in all.
+
+    Raises:
+        SimulationError: It failed; its last words are given.
+    """
+    assembly = scene.assembly
+    body = assembly.body
+    rest = float32(assembly.rest_body)
+    lead = lead_in(body, motion)
+    skipped = lead.num_frames - 1
+    every = Motion(
+        np.concatenate([lead.rotations, motion.rotations[1:]]),  # pyright: ignore[reportArgumentType]
+        np.concatenate([lead.root, motion.root[1:]]),  # pyright: ignore[reportArgumentType]
+        motion.fps,
+    )
+    skin = animate(body, rest, rest[:NUM_BODY_VERTICES], body.weights[:NUM_BODY_VERTICES], every)
+    cloth = animate(body, rest, float32(assembly.rest), float32(assembly.weights), every)
+    arrays: dict[str, np.ndarray] = {
+        "skin": np.asarray(skin, np.float32),
+        "skin_faces": np.asarray(triangulate(body.quads)),
+        "parts": np.asarray(assembly.parts),
+        "cloth": np.asarray(cloth, np.float32),
+        "cloth_rest": assembly.rest.astype(np.float32),
+        "cloth_faces": assembly.faces,
+        "pinned": assembly.pinned,
+        "fps": np.asarray(motion.fps),
+    }
+    total = every.num_frames
+    with tempfile.TemporaryDirectory(prefix="physxnet_") as place:
+        folder = pathlib.Path(place)
+        np.savez(folder / "scene.npz", allow_pickle=False, **arrays)
+        (folder / "settings.json").write_text(json.dumps(dict(settings)))
+        said: list[str] = []
+        with subprocess.Popen(
+            [*command, str(folder)], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        ) as process:
+            assert process.stdout is not None
+            for line in process.stdout:
+                said.append(line.rstrip())
+                done = re.match(r"frame (\d+)", line)
+                if done and progress is not None:
+                    progress(int(done.group(1)), total)
+        result = folder / "cloth.npz"
+        if process.returncode != 0 or not result.is_file():
+            raise SimulationError(
+                f"{name} ended with code {process.returncode}: {' | '.join(said[-5:])}"
+            )
+        with np.load(result) as data:
+            positions, taken = data["positions"], data["milliseconds"]
+    positions = positions[skipped:]
+    speed = np.zeros(positions.shape[:2])
+    speed[1:] = np.linalg.norm(np.diff(positions, axis=0), axis=2) * motion.fps
+    diagnostics = {
+        "finite": np.isfinite(positions).all(axis=(1, 2)),
+        "speed_max": speed.max(axis=1),
+        "worst_vertex": speed.argmax(axis=1),
+        "residual_p99": np.zeros(len(positions)),
+        "milliseconds": taken[skipped:],
+    }
+    pieces = tuple(positions[:, i:j] for i, j in zip(assembly.parts, assembly.parts[1:]))
+    return Rollout(pieces, motion.fps, diagnostics, motion.name)
