@@ -103,31 +103,69 @@ def rolled(rest, angle, radius):
 
 @pytest.mark.parametrize("effect", [Bend(), Dihedral()])
 @pytest.mark.parametrize("n", [17, 33])
-def test_cylinders_of_every_direction_store_half_k_kappa_squared_an_area(effect, n):
+def test_cylinders_along_warp_and_weft_store_half_k_kappa_squared_an_area(effect, n):
     size, radius = 0.2, 0.15
     e, rest = prepared(effect, square_sheet(n, size, fabric=FABRIC))
-    angles = np.arange(8) * np.pi / 8
-    stored = np.asarray([float(energy(e, rest, rolled(rest, a, radius))) for a in angles])
     # Free edges have no hinge: a third of their triangles' area stores nothing.
     covered = size**2 * (1 - 2 / (3 * (n - 1)))
     expected = 0.5 * 1e-4 / radius**2 * covered
-    np.testing.assert_allclose(stored, expected, rtol=0.06)
-    assert stored.mean() == pytest.approx(expected, rel=0.02)
-
-
-def test_bending_of_an_irregular_mesh_is_right_within_a_fifth():
-    """A sheet whose inner vertices are shaken by a third of an edge."""
-    n, size, radius = 25, 0.2, 0.15
-    g = square_sheet(n, size, fabric=FABRIC)
-    v = np.asarray(g.mesh.vertices, np.float64).copy()
-    k = np.arange(n * n).reshape(n, n)[1:-1, 1:-1].ravel()
-    v[k] += np.random.default_rng(0).uniform(-0.33, 0.33, (len(k), 3)) * [1, 0, 1] * size / (n - 1)
-    shaken = free_garment(v, np.asarray(g.mesh.faces), fabric=FABRIC)
-    e, rest = prepared(Bend(), shaken)
-    expected = 0.5 * 1e-4 / radius**2 * size**2
-    for angle in (0.0, 0.5, 1.0):
+    for angle, bound in ((0.0, 0.06), (np.pi / 2, 0.06)):
         stored = float(energy(e, rest, rolled(rest, angle, radius)))
-        assert stored == pytest.approx(expected, rel=0.2), angle
+        assert stored == pytest.approx(expected, rel=bound)
+    # Across the diagonals a grid is stiffer: known, and not more than this.
+    across = float(energy(e, rest, rolled(rest, np.pi / 4, radius)))
+    assert 1.0 < across / expected < 1.6
+
+
+def strip(kind, columns, rows):
+    """A strip of unit length beyond its first three rows, cut into triangles."""
+    length = (rows - 1) / (rows - 3)
+    x, y = np.meshgrid(np.linspace(0, 0.5, columns), np.linspace(0, length, rows))
+    k = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (q.ravel() for q in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
+    turned = np.ones((rows - 1, columns - 1), bool)
+    if kind == "alternating":
+        turned = np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0
+    elif kind == "equilateral":
+        x[1::2] += 0.25 / (columns - 1)
+        turned[::2] = False
+    elif kind == "irregular":
+        inner = np.zeros(x.shape, bool)
+        inner[1:-1, 1:-1] = True
+        noise = np.random.default_rng(0).uniform(-0.3, 0.3, (2, *x.shape)) * 0.5 / (columns - 1)
+        x, y = x + noise[0] * inner, y + noise[1] * inner
+    e = turned.ravel()[:, None]
+    faces = np.concatenate(
+        [
+            np.where(e, np.column_stack([a, c, b]), np.column_stack([a, d, b])),
+            np.where(e, np.column_stack([a, d, c]), np.column_stack([b, d, c])),
+        ]
+    )
+    return np.column_stack([x.ravel(), 0 * x.ravel(), y.ravel()]), faces
+
+
+@pytest.mark.parametrize("kind", ["grid", "alternating", "equilateral", "irregular"])
+def test_a_clamped_strip_sags_like_a_beam_however_it_is_cut(kind):
+    """Small deflections: stiffness k, load q an area, tip at q L^4 / 8 k."""
+    v, faces = strip(kind, 9, 17)
+    e, rest = prepared(Bend(), free_garment(v, faces, fabric=Fabric(bend=1.0)))
+    i, j = e.coupled().T
+    n = len(rest)
+    stiffness = np.zeros((n, n))
+    np.add.at(stiffness, (i, j), e.constant_stiffness())
+    area = 0.5 * np.linalg.norm(
+        np.cross(v[faces[:, 1]] - v[faces[:, 0]], v[faces[:, 2]] - v[faces[:, 0]]), axis=1
+    )
+    load = np.zeros(n)
+    for k in range(3):
+        np.add.at(load, faces[:, k], area / 3)
+    row = np.arange(n) // 9
+    free = row > 2
+    tip = np.zeros(n)
+    tip[free] = np.linalg.solve(stiffness[np.ix_(free, free)], load[free])
+    assert tip[row == 16].mean() == pytest.approx(1 / 8, rel=0.32)
+    # Three times as stiff, as the edge-midpoint Laplacian has it, is far from a beam.
+    assert tip[row == 16].mean() / 3 < 0.5 / 8
 
 
 @pytest.mark.parametrize("effect", [Membrane(), Dihedral(), StrainLimit()])

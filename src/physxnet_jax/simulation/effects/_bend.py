@@ -18,11 +18,10 @@ from ._hinge import bending_hinges
 
 @dataclasses.dataclass(frozen=True)
 class Bend(Effect):
-    """``E = 1/2 sum k f/(A_1 + A_2) |sum_i c_i x_i|^2`` over interior edges.
+    """``E = 1/2 sum k/(A_1 + A_2) |sum_i c_i x_i|^2`` over interior edges.
 
     The coefficients ``c`` come from cotangents of the rest shape, so the energy is
-    quadratic and its Hessian constant. ``f`` is chosen a hinge so that
-    cylinders of all directions store ``k kappa^2 / 2`` an area (see `bending_hinges`).
+    quadratic and its Hessian constant; see `bending_hinges` for its scale.
     Cloth is flat at rest, also where it is worn round a sleeve.
 
     References:

@@ -17,12 +17,11 @@ from ._hinge import bending_hinges
 
 @dataclasses.dataclass(frozen=True)
 class Dihedral(Effect):
-    """``E = 1/2 sum c k |e|^2 / (A_1 + A_2) theta^2`` over interior edges.
+    """``E = 1/2 sum k |e|^2 / (A_1 + A_2) theta^2`` over interior edges.
 
     ``theta`` is the signed angle between the normals, flat at rest. Unlike `Bend` it
-    stays right when the cloth stretches or folds back. What hinges make of a curvature
-    depends on how the mesh is cut; ``c`` is chosen a hinge so that cylinders of all
-    directions store the right energy (see `bending_hinges`).
+    stays right when the cloth stretches or folds back; see `bending_hinges` for its
+    scale.
 
     References:
         Grinspun et al., Discrete shells (2003), equation 2 with the flat rest angle;
