@@ -86,10 +86,13 @@ class Stress:
     Examples:
       physxnet stress
       physxnet stress --cases free_fall scrambled_start --json stress.json
+      physxnet stress --peers blender newton
     """
 
     cases: tuple[str, ...] = ()
     """Names of cases; all of them if none is given."""
+    peers: tuple[Literal["blender", "newton"], ...] = ()
+    """Other simulators that run the cases they can (PHYSXNET_BLENDER, PHYSXNET_NEWTON)."""
     json: pathlib.Path | None = None
     """Write the rows to this file."""
     quiet: bool = False

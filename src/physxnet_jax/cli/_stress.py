@@ -9,9 +9,13 @@ from rich.progress import Progress
 from rich.table import Table
 
 from ..errors import PhysXNetError
-from ..evaluation import CASES, Finding, run_case
+from ..evaluation import CASES, PEER_CASES, Finding, run_case, run_peer
 from ..files import whole_file
+from ..simulation.blender import simulate_blender
+from ..simulation.newton import simulate_newton
 from ._commands import Stress
+
+_ENGINES = {"blender": simulate_blender, "newton": simulate_newton}
 
 
 def stress(command: Stress, console: Console) -> int:
@@ -21,23 +25,46 @@ def stress(command: Stress, console: Console) -> int:
         raise PhysXNetError(f"No case {', '.join(unknown)}; there are {', '.join(CASES)}.")
     names = command.cases or tuple(CASES)
     rows: list[Finding] = []
+    others: dict[tuple[str, str], dict[str, float]] = {}
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("hard cases", total=len(names))
         for name in names:
             rows += run_case(name)
+            if name in PEER_CASES:
+                for peer in command.peers:
+                    others[peer, name] = run_peer(name, _ENGINES[peer])
             # Every case compiles its own programs; kept, they would fill the memory.
             jax.clear_caches()
             bar.advance(task)
     table = Table(title=f"{sum(r.holds for r in rows)} of {len(rows)} bounds hold")
-    for column in ("case", "quantity", "bound", "measured", "holds"):
-        table.add_column(column, justify="right" if column in ("bound", "measured") else "left")
+    for column in ("case", "quantity", "bound", "measured", "holds", *command.peers):
+        left = column in ("case", "quantity", "holds")
+        table.add_column(column, justify="left" if left else "right")
+
+    def beside(r: Finding) -> dict[str, float]:
+        return {
+            p: others[p, r.case][r.quantity]
+            for p in command.peers
+            if r.quantity in others.get((p, r.case), {})
+        }
+
     for r in rows:
+        theirs = beside(r)
         table.add_row(
-            r.case, r.quantity, f"{r.bound:g}", f"{r.measured:.3g}", "yes" if r.holds else "NO"
+            r.case,
+            r.quantity,
+            f"{r.bound:g}",
+            f"{r.measured:.3g}",
+            "yes" if r.holds else "NO",
+            *(f"{theirs[p]:.3g}" if p in theirs else "" for p in command.peers),
         )
     console.print(table)
+    for p in command.peers:
+        tried = [(r, beside(r)[p]) for r in rows if p in beside(r)]
+        held = sum(value <= r.bound for r, value in tried)
+        console.print(f"{p}: {held} of {len(tried)} bounds hold", highlight=False)
     if command.json is not None:
-        data = [{**dataclasses.asdict(r), "holds": r.holds} for r in rows]
+        data = [{**dataclasses.asdict(r), "holds": r.holds, **beside(r)} for r in rows]
         with whole_file(command.json) as part:
             part.write_text(json.dumps(data, indent=1) + "\n")
     return 0 if all(r.holds for r in rows) else 1

@@ -1,6 +1,5 @@
 """Metrics and reports: what an answer is worth, and what holds where it is hard."""
 
-from . import _stress_worn as _stress_worn  # its cases join the others
 from ._bench import (
     JITTER as JITTER,
     BenchScene as BenchScene,
@@ -20,3 +19,11 @@ from ._price import (
 )
 from ._strain import edge_strain as edge_strain
 from ._stress import CASES as CASES, Finding as Finding, run_case as run_case
+from ._stress_worn import PEER_CASES as PEER_CASES, run_peer as run_peer
+from ._textile import (
+    DRAPE_BANDS as DRAPE_BANDS,
+    Cantilever as Cantilever,
+    Drape as Drape,
+    cantilever_test as cantilever_test,
+    drape_test as drape_test,
+)

@@ -55,16 +55,20 @@ shirtings (1 to 5 x 10^-5 N m), stretching as stiff as 32 substeps carry."""
 FABRICS: dict[str, Fabric] = {
     "cotton": COTTON,
     "denim": Fabric(0.40, 4000.0, 1.2e-4, 0.005, 0.40, 9000.0, 6000.0, 200.0),
-    "silk": Fabric(0.07, 1500.0, 4e-6, 0.003, 0.20, 3500.0, 2500.0, 25.0),
-    "wool": Fabric(0.23, 1500.0, 1.2e-5, 0.005, 0.35, 2500.0, 1800.0, 50.0),
-    "jersey": Fabric(0.18, 400.0, 3e-6, 0.004, 0.35, 500.0, 250.0, 40.0),
-    "leather": Fabric(0.75, 6000.0, 6e-4, 0.006, 0.45, 8000.0, 8000.0, 2500.0),
+    "silk": Fabric(0.07, 1500.0, 2e-6, 0.003, 0.20, 3500.0, 2500.0, 25.0),
+    "wool": Fabric(0.23, 1500.0, 1.5e-5, 0.005, 0.35, 2500.0, 1800.0, 50.0),
+    "jersey": Fabric(0.18, 400.0, 4e-6, 0.004, 0.35, 500.0, 250.0, 40.0),
+    "leather": Fabric(0.75, 6000.0, 9e-5, 0.006, 0.45, 8000.0, 8000.0, 2500.0),
 }
-"""Fabrics by name. Density, bending, warp, weft and shear lie within the ranges that
-the Kawabata evaluation system gives for such cloth (bending 0.02 to 1.5 gf cm^2/cm,
-shear 0.3 to 4 gf/cm degree, secant modulus up to 500 gf/cm; Kawabata, The standardization
-and analysis of hand evaluation, 1980; 1 gf cm^2/cm = 9.8e-5 N m, 1 gf/cm degree =
-56 N/m). ``stretch`` is what springs along edges carry at 32 substeps."""
+"""Fabrics by name; leather is that of garments, soft.
+
+Density, bending, warp, weft and shear lie within the ranges that the Kawabata evaluation
+system gives for such cloth (bending 0.02 to 1.5 gf cm^2/cm, shear 0.3 to 4 gf/cm degree,
+secant modulus up to 500 gf/cm; Kawabata, The standardization and analysis of hand
+evaluation, 1980; 1 gf cm^2/cm = 9.8e-5 N m, 1 gf/cm degree = 56 N/m). Within those,
+bending is where Cusick's drape coefficient falls into its published band (`drape_test`).
+``stretch`` is what springs along edges carry at 32 substeps.
+"""
 
 
 @pytree

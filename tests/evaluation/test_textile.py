@@ -1,0 +1,36 @@
+"""Fabrics behave as laboratories measure them."""
+
+import dataclasses
+
+import pytest
+
+from physxnet_jax.evaluation import DRAPE_BANDS, cantilever_test, drape_test
+from physxnet_jax.garment import FABRICS
+
+# Coarser than the default, for time.
+EDGE = 0.011
+
+
+@pytest.mark.parametrize("name", sorted(FABRICS))
+def test_drape_lies_in_its_published_band(name):
+    low, high, _ = DRAPE_BANDS[name]
+    drape = drape_test(FABRICS[name], edge=EDGE, seconds=4.0)
+    assert low <= drape.coefficient <= high
+    assert drape.folds >= 3, "a disc that bends in one direction only isn't cloth"
+    assert drape.speed < 0.1
+
+
+def test_a_board_stays_flat_and_a_rag_hangs_down():
+    """The controls: the instrument's two ends."""
+    stiff = dataclasses.replace(FABRICS["cotton"], bend=1e-2)
+    assert drape_test(stiff, edge=EDGE, seconds=1.0).coefficient > 97
+    limp = dataclasses.replace(FABRICS["cotton"], bend=1e-7)
+    assert drape_test(limp, edge=EDGE, seconds=4.0).coefficient < 20
+
+
+def test_a_strip_dips_as_its_bending_length_says():
+    cotton = cantilever_test(FABRICS["cotton"], cells=12)
+    assert cotton.measured == pytest.approx(cotton.length, rel=0.1)
+    # A strip eight times as stiff has twice the bending length, not the same.
+    stiff = dataclasses.replace(FABRICS["cotton"], bend=8 * FABRICS["cotton"].bend)
+    assert cantilever_test(stiff, cells=12).length == pytest.approx(2 * cotton.length)
