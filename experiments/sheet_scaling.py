@@ -37,6 +37,8 @@ FRAMES, REPEATS, SUBSTEPS = 10, 5, 32
 
 @dataclasses.dataclass(frozen=True)
 class Row:
+    """One sheet."""
+
     vertices: int
     ms_per_frame: float
     ns_per_vertex_substep: float
