@@ -1,0 +1,105 @@
+"""Other simulators: what they are handed and what is taken back, with a stand-in for them."""
+
+import dataclasses
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.errors import MissingDependencyError, SimulationError
+from physxnet_jax.evaluation import PEER_CASES, run_peer
+from physxnet_jax.garment import square_sheet
+from physxnet_jax.motion import animate, load_motion
+from physxnet_jax.simulation import Rollout, Scene, prepare_scene
+from physxnet_jax.simulation._outside import simulate_outside
+from physxnet_jax.simulation.newton import find_newton
+
+COPY = """
+import json, pathlib, sys
+import numpy as np
+folder = pathlib.Path(sys.argv[-1])
+data = np.load(folder / "scene.npz")
+wanted = json.loads((folder / "settings.json").read_text())
+for k in range(len(data["cloth"])):
+    print(f"frame {k + 1}", flush=True)
+np.savez(
+    folder / "cloth.npz",
+    positions=data["cloth"] + np.float32(wanted["lift"]),
+    milliseconds=np.arange(len(data["cloth"])) * 1.0,
+)
+"""
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return prepare_scene(Scene((square_sheet(4),), ()))
+
+
+@pytest.fixture(scope="module")
+def motion():
+    m = load_motion("walk", fps=30.0)
+    return dataclasses.replace(m, rotations=m.rotations[:5], root=m.root[:5])
+
+
+def test_the_clip_comes_back_without_its_lead_in(tmp_path, scene, motion):
+    script = tmp_path / "copy.py"
+    script.write_text(COPY)
+    seen = []
+    command = [sys.executable, str(script)]
+    out = simulate_outside("Copy", command, scene, motion, {"lift": 1.0}, lambda *a: seen.append(a))
+    assert out.positions[0].shape == (5, 16, 3)
+    flat = simulate_outside("Copy", command, scene, motion, {"lift": 0.0}, None)
+    np.testing.assert_allclose(out.positions[0] - flat.positions[0], 1.0, atol=1e-5)
+    a = scene.assembly
+    f = jnp.float32
+    skinned = animate(
+        a.body,
+        jnp.asarray(a.rest_body, f),
+        jnp.asarray(a.rest, f),
+        jnp.asarray(a.weights, f),
+        motion,
+    )
+    np.testing.assert_allclose(flat.positions[0], skinned, atol=1e-5)
+    total = seen[-1][1]
+    assert seen[-1][0] == total and total > 5
+    assert out.finite.all() and len(out.diagnostics["milliseconds"]) == 5
+
+
+def test_its_last_words_are_given_when_it_fails(tmp_path, scene, motion):
+    script = tmp_path / "fail.py"
+    script.write_text("print('no cloth today')\nraise SystemExit(3)\n")
+    with pytest.raises(SimulationError, match=r"Copy ended with code 3.*no cloth today"):
+        simulate_outside("Copy", [sys.executable, str(script)], scene, motion, {}, None)
+
+
+def test_without_newton_the_way_to_it_is_told(monkeypatch):
+    monkeypatch.delenv("PHYSXNET_NEWTON", raising=False)
+    with pytest.raises(MissingDependencyError, match="PHYSXNET_NEWTON"):
+        find_newton()
+
+
+def test_a_peer_is_judged_by_its_vertices_alone():
+    """A simulator that leaves the trousers at rest, far from a spinning body."""
+
+    def lazy(scene: Scene, motion) -> Rollout:
+        rest = prepare_scene(scene).assembly.rest.astype(np.float32)
+        x = np.repeat(rest[None], motion.num_frames, axis=0)
+        return Rollout((x,), motion.fps, {}, "lazy")
+
+    seen = run_peer("first_frame_far_from_rest", lazy)
+    assert seen["frames not finite"] == 0
+    assert seen["99 % of edges at the end (strain)"] < 1e-6
+
+    def broken(scene: Scene, motion) -> Rollout:
+        out = lazy(scene, motion)
+        out.positions[0][3] = np.nan
+        return out
+
+    assert run_peer("first_frame_far_from_rest", broken)["frames not finite"] == 1
+    assert set(PEER_CASES) == {
+        "first_frame_far_from_rest",
+        "limbs_at_eight_times_their_speed",
+        "a_teleport_of_two_metres",
+        "closed_armpits_and_crossed_arms",
+    }
