@@ -4,6 +4,7 @@ import pathlib
 import re
 
 from physxnet_jax.dressing import load_scene
+from physxnet_jax.garment import FABRICS
 from physxnet_jax.simulation import EFFECTS, Air
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -27,5 +28,9 @@ def test_every_effect_is_listed():
 
 def test_the_tables_are_the_measured_ones():
     measured = (ROOT / "experiments/results/sim_bench.md").read_text()
-    rows = [r for r in TEXT.splitlines() if r.startswith(("| xpbd", "| bdf2", "| blender"))]
-    assert len(rows) > 10 and all(r in measured for r in rows)
+    solvers = ("| xpbd", "| bdf2", "| backward", "| verlet", "| blender", "| newton")
+    rows = [r for r in TEXT.splitlines() if r.startswith(solvers)]
+    assert len(rows) > 20 and all(r in measured for r in rows)
+    textile = (ROOT / "experiments/results/textile.md").read_text()
+    rows = [r for r in TEXT.splitlines() if r.startswith(tuple(f"| {f} |" for f in FABRICS))]
+    assert len(rows) == len(FABRICS) and all(r in textile for r in rows)

@@ -144,6 +144,19 @@ def _fast_punch() -> Motion:
 
 
 @case
+def standing_still() -> Iterator[tuple[str, float, float]]:
+    """A dress on a body that doesn't move: it comes to rest and stays there."""
+    m = load_motion("balance", fps=_FPS)
+    index = np.zeros(60, int)
+    out = _worn(dataclasses.replace(m, rotations=m.rotations[index], root=m.root[index]), "dress")
+    yield from _body_rows(out)
+    x = out.positions[0][-20:].astype(np.float64)
+    acceleration = np.linalg.norm(np.diff(x, n=2, axis=0), axis=2) * _FPS**2
+    yield "acceleration, median (m/s^2)", 0.5, float(np.median(acceleration))
+    yield "acceleration, 99 % (m/s^2)", 5.0, float(np.quantile(acceleration, 0.99))
+
+
+@case
 def limbs_at_eight_times_their_speed() -> Iterator[tuple[str, float, float]]:
     out, rows = _ours("limbs_at_eight_times_their_speed")
     yield from rows

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..garment import Fabric, free_garment
+from ..garment import Fabric, free_garment, grid_faces
 from ..simulation import (
     XPBD,
     Bend,
@@ -128,7 +128,7 @@ def cantilever_test(fabric: Fabric, *, cells: int = 16, solver: Solver | None = 
     rows = cells + 3
     x, z = np.meshgrid(cell * np.arange(columns), cell * np.arange(rows))
     v = np.column_stack([x.ravel(), 0 * x.ravel(), z.ravel()])
-    faces = _cells(rows, columns)
+    faces = grid_faces(rows, columns)
     pinned = np.arange(3 * columns)
     strip = free_garment(v, faces, pinned=pinned, fabric=fabric)
     effects = (Gravity(), Stretch(compression=1.0), Bend(), Pin())
@@ -159,15 +159,6 @@ def _disc(
     p = np.concatenate([p, radius * np.column_stack([np.cos(turn), np.sin(turn)])])
     faces = Delaunay(p).simplices
     return np.column_stack([p[:, 0], np.zeros(len(p)), p[:, 1]]), faces.astype(np.int64)
-
-
-def _cells(rows: int, columns: int) -> Int[np.ndarray, "faces 3"]:
-    k = np.arange(rows * columns).reshape(rows, columns)
-    a, b, c, d = (q.ravel() for q in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
-    even = (np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0).ravel()[:, None]
-    first = np.where(even, np.column_stack([a, c, b]), np.column_stack([a, d, b]))
-    second = np.where(even, np.column_stack([a, d, c]), np.column_stack([b, d, c]))
-    return np.concatenate([first, second])
 
 
 def _shadow(x: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> float:

@@ -14,7 +14,11 @@ from ._garment import (
     Template as Template,
     carried_weights as carried_weights,
 )
-from ._sheet import free_garment as free_garment, square_sheet as square_sheet
+from ._sheet import (
+    free_garment as free_garment,
+    grid_faces as grid_faces,
+    square_sheet as square_sheet,
+)
 from ._templates import (
     build_template as build_template,
     stored_arrays as stored_arrays,

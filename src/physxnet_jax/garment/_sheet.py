@@ -39,13 +39,20 @@ def square_sheet(
         v = np.column_stack([x.ravel(), -y.ravel(), zero]) + corner
     else:
         v = np.column_stack([x.ravel(), zero, y.ravel()]) + corner
-    k = np.arange(n * n).reshape(n, n)
+    return free_garment(v, grid_faces(n, n), pinned=pinned, fabric=fabric)
+
+
+def grid_faces(rows: int, columns: int) -> Int[np.ndarray, "faces 3"]:
+    """Triangles of a grid whose vertex ``i * columns + j`` lies in row i and column j.
+
+    Diagonals alternate, so that no direction is favoured.
+    """
+    k = np.arange(rows * columns).reshape(rows, columns)
     a, b, c, d = (q.ravel() for q in (k[:-1, :-1], k[:-1, 1:], k[1:, 1:], k[1:, :-1]))
-    # Diagonals alternate, so that no direction is favoured.
-    even = (np.add.outer(np.arange(n - 1), np.arange(n - 1)) % 2 == 0).ravel()[:, None]
+    even = (np.add.outer(np.arange(rows - 1), np.arange(columns - 1)) % 2 == 0).ravel()[:, None]
     first = np.where(even, np.column_stack([a, c, b]), np.column_stack([a, d, b]))
     second = np.where(even, np.column_stack([a, d, c]), np.column_stack([b, d, c]))
-    return free_garment(v, np.concatenate([first, second]), pinned=pinned, fabric=fabric)
+    return np.concatenate([first, second])
 
 
 def free_garment(
