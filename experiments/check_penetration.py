@@ -66,8 +66,10 @@ def main() -> None:
     actions = [a for a in read_protocol(folder / "mocap") if a.split == "test"]
     jobs = [(n, a) for n in TEMPLATES for a in actions if (a.name, n) not in done]
     for name, action in track(jobs, description="actions"):
+        if rows and rows[-1]["template"] != name:
+            # Each garment has programs of its own; kept, they would fill the memory.
+            jax.clear_caches()
         rows.append(one(name, action, folder, words.accuracy))
-        jax.clear_caches()
         with whole_file(path) as part:
             part.write_text(json.dumps({"accuracy": words.accuracy, "rows": rows}, indent=1) + "\n")
     lines = [

@@ -106,9 +106,10 @@ def penetration(
     for k, x in zip(range(len(looked)), positions[looked]):
         s = skin[k]
         normal = np.asarray(vertex_normals(jnp.asarray(s), jnp.asarray(faces)))
-        near = _nearest(s, x)
+        whole, trees = _tree(s), [_tree(s[limb.vertices]) for limb in limbs]
+        near = _ask(whole, x)
         height, _, _ = _height(x, s, normal, faces, around, near)
-        lowest = np.minimum(height, _in_limbs(x, s, normal, limbs))
+        lowest = np.minimum(height, _in_limbs(x, s, normal, limbs, trees))
         wrong = lowest < 0
         inside.append(wrong)
         depth.append(np.where(wrong, -lowest, 0.0))
@@ -124,11 +125,13 @@ def penetration(
             at: np.ndarray,
             s: np.ndarray = s,
             normal: np.ndarray = normal,
+            whole: KDTree = whole,
+            trees: list[KDTree] = trees,
         ) -> np.ndarray:
             """Whether there is no place at this height above skin."""
             above = foot + room[:, None] * up
-            clear, _, _ = _height(above, s, normal, faces, around, _nearest(s, above))
-            crossed = _in_limbs(above, s, normal, limbs, but=segment[at]) < 0
+            clear, _, _ = _height(above, s, normal, faces, around, _ask(whole, above))
+            crossed = _in_limbs(above, s, normal, limbs, trees, but=segment[at]) < 0
             return crossed | (clear < _CLEAR * room)
 
         pinched.append(wrong & crowded(foot, up, assembly.thickness, at))
@@ -188,23 +191,22 @@ def _in_limbs(
     s: Float[np.ndarray, "body 3"],
     normal: Float[np.ndarray, "body 3"],
     limbs: list[_Limb],
+    trees: list[KDTree],
     *,
     but: Int[np.ndarray, " points"] | None = None,
 ) -> Float[np.ndarray, " points"]:
     """Least height over any limb's skin, at most 0; not over the segment ``but``."""
     out = np.zeros(len(x))
-    for limb in limbs:
-        near = limb.vertices[_nearest(s[limb.vertices], x)]
-        gap = x - s[near]
-        close = np.einsum("pi,pi->p", gap, gap) < limb.thick**2
+    for limb, tree in zip(limbs, trees, strict=True):
+        rows = np.arange(len(x)) if but is None else np.flatnonzero(but != limb.segment)
+        far, near = map(np.asarray, tree.query(x[rows], distance_upper_bound=limb.thick))
+        rows, near = rows[np.isfinite(far)], limb.vertices[near[np.isfinite(far)]]
         # Only points beneath the nearest vertex's plane, or nearly, can be inside.
-        close &= np.einsum("pi,pi->p", gap, normal[near]) < _CURVED
-        if but is not None:
-            close &= but != limb.segment
-        rows = np.flatnonzero(close)
+        under = np.einsum("pi,pi->p", x[rows] - s[near], normal[near]) < _CURVED
+        rows, near = rows[under], near[under]
         if not len(rows):
             continue
-        height, weights, face = _height(x[rows], s, normal, limb.faces, limb.around, near[rows])
+        height, weights, face = _height(x[rows], s, normal, limb.faces, limb.around, near)
         at_end = (weights * limb.rim[limb.faces[face]]).sum(axis=1) > 0.999
         out[rows] = np.minimum(out[rows], np.where(at_end, 0.0, height))
     return out
@@ -237,10 +239,19 @@ def _clothed(
     return beneath & ((weights * ~rim[assembly.faces[face]]).sum(axis=1) > 0.05)
 
 
+def _tree(points: Float[np.ndarray, "points 3"]) -> KDTree:
+    # Built for every frame and asked once: a balanced one would take longer to build.
+    return KDTree(points, balanced_tree=False, compact_nodes=False)
+
+
 def _nearest(
     of: Float[np.ndarray, "many 3"], to: Float[np.ndarray, "points 3"]
 ) -> Int[np.ndarray, " points"]:
-    return np.reshape(KDTree(of).query(to)[1], len(to))
+    return _ask(_tree(of), to)
+
+
+def _ask(tree: KDTree, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
+    return np.reshape(tree.query(points)[1], len(points))
 
 
 def _walk(
