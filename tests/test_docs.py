@@ -4,7 +4,7 @@ import pathlib
 import re
 
 from physxnet_jax.dressing import load_scene
-from physxnet_jax.garment import FABRICS
+from physxnet_jax.garment import FABRICS, TEMPLATES
 from physxnet_jax.simulation import EFFECTS, Air
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -31,6 +31,9 @@ def test_the_tables_are_the_measured_ones():
     solvers = ("| xpbd", "| bdf2", "| backward", "| verlet", "| blender", "| newton")
     rows = [r for r in TEXT.splitlines() if r.startswith(solvers)]
     assert len(rows) > 20 and all(r in measured for r in rows)
+    penetration = (ROOT / "experiments/results/penetration.md").read_text()
+    rows = [r for r in TEXT.splitlines() if r.startswith(tuple(f"| {t} |" for t in TEMPLATES))]
+    assert len(rows) == len(TEMPLATES) and all(r in penetration for r in rows)
     textile = (ROOT / "experiments/results/textile.md").read_text()
     rows = [r for r in TEXT.splitlines() if r.startswith(tuple(f"| {f} |" for f in FABRICS))]
     assert len(rows) == len(FABRICS) and all(r in textile for r in rows)
