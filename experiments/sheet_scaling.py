@@ -1,7 +1,7 @@
 """How the simulator's time grows with the number of vertices, and with the batch.
 
 Command: python experiments/sheet_scaling.py
-Cost:    about three minutes on two cores, on a quiet machine.
+Cost:    about a minute on two cores, on a quiet machine.
 Result:  experiments/results/sheet_scaling.json and .md: milliseconds a frame and nanoseconds a
          vertex and substep of hanging sheets of 1,024 to 16,384 vertices, XPBD at its default
          setting. No size may cost many times more a vertex than the smaller ones; sag of the
