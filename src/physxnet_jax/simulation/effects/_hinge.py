@@ -42,12 +42,12 @@ def sound(x: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"])
 def bending_hinges(assembly: Assembly) -> Hinges:
     """The hinges of a scene, weighted by ``1 / A``.
 
-    With ``3 / A``, which makes the quadratic form a Laplacian of edge midpoints (Bergou et
-    al. 2006), strips sag only 0.4 times as far as a beam of the same stiffness. With
-    ``1 / A`` cylinders about an axis of a grid store ``k kappa^2 / 2`` an area within
-    3 %, and strips clamped at one end sag 1.1 to 1.3 times as far as beams, whichever way
-    the mesh is cut: farthest on right-angled grids (tested). Fitting weights hinge by hinge to cylinders of all directions makes strips
-    1.4 to 2.7 times too soft: some hinges nearly vanish.
+    With ``3 / A``, which makes the quadratic form a Laplacian of edge midpoints (Bergou et al.
+    2006), strips sag only 0.4 times as far as a beam of the same stiffness. With ``1 / A``
+    cylinders about an axis of a grid store ``k kappa^2 / 2`` an area within 3 %, and strips
+    clamped at one end sag 1.1 to 1.3 times as far as beams, whichever way the mesh is cut:
+    farthest on right-angled grids (tested). Fitting weights hinge by hinge to cylinders of all
+    directions made them sag farther still: some hinges nearly vanish.
     """
     x = assembly.rest
     every = hinges(assembly.faces[sound(x, assembly.faces)])
