@@ -327,10 +327,11 @@ class _Contact(Prepared):
         there = there / jnp.maximum(1.0 - (jnp.maximum(there, 0.0) / ROOM) ** 2, ROOM / _FREE)
         there = jnp.where(self.hanging[..., None], _FREE, there)
         thickness = self.thickness[..., None]
-        # Layers keep their order: the outermost lies in the middle.
+        # Layers keep their order both ways: the outermost lies in the middle.
         outermost = self.thickness.max()
-        low = jnp.minimum(thickness, 0.5 * there + _COVER - (outermost - thickness))
-        return low, jnp.maximum(there - outermost, low)
+        under = outermost - thickness
+        low = jnp.minimum(thickness, 0.5 * there + _COVER - under)
+        return low, jnp.maximum(there - outermost - under, low)
 
     def accelerate(self, velocity: Array, context: _Touch, h: float) -> Array:
         unit, ceiling = context.unit, context.ceiling
