@@ -38,13 +38,14 @@ def main() -> None:
     predictor = px.load_predictor()
     size = predictor.config.resolution
     motion = load_motion("punch", fps=30.0)
+    seen = predictor.config.inputs
     world, shift = (
-        jnp.asarray(x[FRAME - 4 : FRAME + 1]) for x in clip_transforms(body, rest, motion)
+        jnp.asarray(x[FRAME + 1 - seen.window : FRAME + 1])
+        for x in clip_transforms(body, rest, motion)
     )
     surface = predictor.surface
-    inputs = np.asarray(clip_features(surface.rest, surface.weights, world, shift, 30.0, "local"))[
-        0
-    ]
+    features = clip_features(surface.rest, surface.weights, world, shift, 30.0, seen)
+    inputs = np.asarray(features)[0]
     outputs = predictor(world, shift, 30.0, predictor.config.templates)
     texels = np.asarray(predictor.atlas.texels)
     shown = [inputs[:, 6:9], inputs[:, 15:18], inputs[:, 18:21]]

@@ -45,7 +45,9 @@ def main() -> None:
         world, shift = body.transforms(rest, base.at[index].set(moved), root)
         # One pose held still: four copies stand for the frames before it.
         frames = (pad[None] for pad in (world, shift))
-        return px.dress_frames(predictor, wearables, *(px.pad_clip(x) for x in frames), 30.0)
+        return px.dress_frames(
+            predictor, wearables, *(px.pad_clip(x, predictor.config.inputs) for x in frames), 30.0
+        )
 
     rng = np.random.default_rng(0)
     target = clothes(jnp.asarray(rng.normal(0, 0.5, (len(JOINTS), 3)), jnp.float32))

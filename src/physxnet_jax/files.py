@@ -1,6 +1,7 @@
 """Writing files whole or not at all."""
 
 import contextlib
+import os
 import pathlib
 from collections.abc import Iterator
 
@@ -19,8 +20,9 @@ def whole_file(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
     """
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The suffix stays: some writers choose their format by it.
-    part = path.with_name(f".part-{path.name}")
+    # The suffix stays: some writers choose their format by it. Processes may write side
+    # by side what is the same.
+    part = path.with_name(f".part-{os.getpid()}-{path.name}")
     try:
         yield part
         part.replace(path)

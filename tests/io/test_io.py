@@ -185,7 +185,7 @@ def test_meshes_that_are_nowhere_near_a_body_are_refused(tmp_path):
 def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
     assert "first" in list_weights()
     predictor = load_predictor("first")
-    assert read_card("first")["model"]["family"] == "local"
+    assert read_card("first")["model"]["inputs"]["family"] == "local"
     save_predictor(tmp_path / "w", predictor, name="copy")
     again = load_predictor(tmp_path / "w")
     import jax

@@ -8,9 +8,10 @@ from flax import nnx
 from scipy.spatial.transform import Rotation
 
 from physxnet_jax.models import (
-    WINDOW,
+    PAPER,
     Discriminator,
     Generator,
+    Inputs,
     ModelConfig,
     Normalisation,
     Predictor,
@@ -108,6 +109,11 @@ def worn(body, rest):
     return atlas, surface, wearables
 
 
+LOCAL = Inputs()
+PAPER_FAR = Inputs("paper", frames=3, stride=3)
+PAPER_ONE = Inputs("paper", frames=1)
+
+
 def transforms(body, rest, turn=None):
     motion = load_motion("punch", fps=30.0)
     q, p = np.asarray(motion.rotations[:8]).copy(), np.asarray(motion.root[:8]).copy()
@@ -126,10 +132,10 @@ def test_local_features_do_not_see_a_turn_about_the_vertical_but_paper_ones_do(w
     turn = Rotation.from_euler("Y", 1.1)
     out = {}
     for name, t in (("a", None), ("b", turn)):
-        r, s = (pad_clip(x) for x in transforms(body, rest, t))
-        for family in ("local", "paper"):
-            out[name, family] = np.asarray(
-                clip_features(surface.rest, surface.weights, r, s, 30.0, family)
+        for inputs in (LOCAL, PAPER):
+            r, s = (pad_clip(x, inputs) for x in transforms(body, rest, t))
+            out[name, inputs.family] = np.asarray(
+                clip_features(surface.rest, surface.weights, r, s, 30.0, inputs)
             )
     scale = np.abs(out["a", "local"]).max()
     assert np.abs(out["a", "local"] - out["b", "local"]).max() < 1e-3 * scale
@@ -137,28 +143,72 @@ def test_local_features_do_not_see_a_turn_about_the_vertical_but_paper_ones_do(w
         np.abs(out["a", "paper"] - out["b", "paper"]).max() > 0.1 * np.abs(out["a", "paper"]).max()
     )
     tipped = Rotation.from_euler("X", 0.5)
-    r, s = (pad_clip(x) for x in transforms(body, rest, tipped))
-    tilted = np.asarray(clip_features(surface.rest, surface.weights, r, s, 30.0, "local"))
+    r, s = (pad_clip(x, LOCAL) for x in transforms(body, rest, tipped))
+    tilted = np.asarray(clip_features(surface.rest, surface.weights, r, s, 30.0, LOCAL))
     # The velocities are the same, gravity isn't: the network can feel which way is down.
     assert np.abs(out["a", "local"][..., :9] - tilted[..., :9]).max() < 1e-3 * scale
-    assert np.abs(out["a", "local"][..., 18:] - tilted[..., 18:]).max() > 0.2
+    assert np.abs(out["a", "local"][..., 18:21] - tilted[..., 18:21]).max() > 0.2
 
 
-def test_features_of_a_window_equal_features_of_the_clip(worn, body, rest):
+@pytest.mark.parametrize(
+    "inputs",
+    [
+        PAPER,
+        Inputs(),
+        Inputs(frames=2, stride=3, acceleration=False),
+        Inputs(frames=1, place=False),
+    ],
+    ids=["paper", "local", "far", "one"],
+)
+def test_features_of_a_window_equal_features_of_the_clip(worn, body, rest, inputs):
     _, surface, _ = worn
     world, shift = transforms(body, rest)
     clip = clip_features(
-        surface.rest, surface.weights, pad_clip(world), pad_clip(shift), 30.0, "local"
+        surface.rest,
+        surface.weights,
+        pad_clip(world, inputs),
+        pad_clip(shift, inputs),
+        30.0,
+        inputs,
     )
-    windows = [pose_windows(x) for x in (world, shift)]
-    assert windows[0].shape[1] == WINDOW
+    assert clip.shape == (8, surface.rest.shape[0], inputs.channels)
+    windows = [pose_windows(x, inputs) for x in (world, shift)]
+    assert windows[0].shape[1] == inputs.window
     each = jnp.stack(
         [
-            clip_features(surface.rest, surface.weights, r, s, 30.0, "local")[0]
+            clip_features(surface.rest, surface.weights, r, s, 30.0, inputs)[0]
             for r, s in zip(*windows)
         ]
     )
     np.testing.assert_allclose(np.asarray(clip), np.asarray(each), atol=2e-2)
+
+
+def test_a_stride_looks_back_by_whole_frames(worn, body, rest):
+    """The oldest velocity of every third frame is that of six frames before."""
+    _, surface, _ = worn
+    world, shift = transforms(body, rest)
+    far, near = Inputs(frames=3, stride=3), Inputs(frames=1)
+    at = (surface.rest, surface.weights)
+    old = clip_features(*at, pad_clip(world, far), pad_clip(shift, far), 30.0, PAPER_FAR)
+    new = clip_features(*at, pad_clip(world, near), pad_clip(shift, near), 30.0, PAPER_ONE)
+    np.testing.assert_allclose(np.asarray(old)[6:, :, :3], np.asarray(new)[:2, :, :3], atol=2e-2)
+    assert np.abs(np.asarray(old)[6:, :, :3] - np.asarray(new)[6:, :, :3]).max() > 0.1
+
+
+def test_place_tells_the_pose_when_nothing_moves(worn, body, rest):
+    """A raised arm that is held still: velocities are silent, its place is not."""
+    _, surface, _ = worn
+    world, shift = transforms(body, rest)
+    still = [jnp.repeat(x[:1], 5, axis=0) for x in (world, shift)]
+    raised = [jnp.repeat(x[7:8], 5, axis=0) for x in (world, shift)]
+    a, b = (
+        np.asarray(clip_features(surface.rest, surface.weights, *p, 30.0, LOCAL))[0]
+        for p in (still, raised)
+    )
+    assert np.abs(a[:, :18]).max() == 0 and np.abs(b[:, :18]).max() == 0
+    assert np.abs(a[:, 21:] - b[:, 21:]).max() > 0.01
+    with pytest.raises(ValueError, match="at least 1"):
+        Inputs(frames=0)
 
 
 def test_speed_is_in_metres_a_second_at_any_frame_rate(worn, body, rest):
@@ -174,7 +224,7 @@ def test_speed_is_in_metres_a_second_at_any_frame_rate(worn, body, rest):
             jnp.asarray(world[k - 4 : k + 1]),
             jnp.asarray(shift[k - 4 : k + 1]),
             m.fps,
-            "paper",
+            PAPER,
         )
         speeds.append(np.linalg.norm(np.asarray(f[0, :, 6:9]), axis=1).mean())
     assert speeds[0] == pytest.approx(speeds[1], rel=0.15)
@@ -182,7 +232,7 @@ def test_speed_is_in_metres_a_second_at_any_frame_rate(worn, body, rest):
 
 def predictor(worn, family, zero=False):
     atlas, surface, _ = worn
-    config = ModelConfig(family=family, resolution=32, width=4, templates=("top", "dress"))
+    config = ModelConfig(Inputs(family), resolution=32, width=4, templates=("top", "dress"))
     network = make_generator(config)
     network.eval()
     graph, state = nnx.split(network)
@@ -203,7 +253,7 @@ def test_zero_output_of_the_local_family_is_exactly_skinning(worn, body, rest):
     _, _, wearables = worn
     r, s = transforms(body, rest)
     out = dress_frames(
-        predictor(worn, "local", zero=True), wearables, pad_clip(r), pad_clip(s), 30.0
+        predictor(worn, "local", zero=True), wearables, pad_clip(r, LOCAL), pad_clip(s, LOCAL), 30.0
     )
     for w, x in zip(wearables, out):
         skinned = jax.vmap(lambda a, b, w=w: skin_wearable(w, a, b))(r, s)
@@ -215,7 +265,7 @@ def test_turning_the_person_turns_the_answer(worn, body, rest):
     turn = Rotation.from_euler("Y", 0.8)
     p = predictor(worn, "local")
     runs = [
-        dress_frames(p, wearables, *(pad_clip(x) for x in transforms(body, rest, t)), 30.0)
+        dress_frames(p, wearables, *(pad_clip(x, LOCAL) for x in transforms(body, rest, t)), 30.0)
         for t in (None, turn)
     ]
     for a, b in zip(*runs):

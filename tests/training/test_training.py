@@ -11,17 +11,20 @@ import pytest
 from physxnet_jax.data import Sequence
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.garment import template
-from physxnet_jax.models import ModelConfig
+from physxnet_jax.models import PAPER, ModelConfig
 from physxnet_jax.motion import load_motion
 from physxnet_jax.training import (
     TrainConfig,
     adversarial_loss,
     batch_indices,
     discriminator_loss,
+    map_picture,
     masked_l1,
+    read_metrics,
     soft_labels,
     train,
 )
+from physxnet_jax.training._watch import Players, Validation
 
 CONFIG = TrainConfig(
     model=ModelConfig(resolution=32, width=4, templates=("bottom", "top")),
@@ -121,8 +124,76 @@ def test_cloth_that_came_off_is_left_out(tmp_path):
 
 def test_the_paper_family_trains_as_well(tmp_path):
     config = dataclasses.replace(
-        CONFIG, model=dataclasses.replace(CONFIG.model, family="paper"), adversarial=False
+        CONFIG, model=dataclasses.replace(CONFIG.model, inputs=PAPER), adversarial=False
     )
     values = []
     train(config, [sequence()], tmp_path, steps=40, report=lambda a, b, m: values.append(m))
     assert values[-1]["l1"] < values[0]["l1"]
+
+
+def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):
+    config = dataclasses.replace(CONFIG, validation=("b",), validate_every=4, epochs=40, patience=2)
+    data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
+    # A far too high rate makes it worse sooner or later.
+    config = dataclasses.replace(config, learning_rate=0.3, adversarial=False, max_skipped=10**6)
+    train(config, data, tmp_path)
+    log = read_metrics(tmp_path)
+    measured = [x["validation_mm"] for x in log if "validation_mm" in x]
+    best = int(np.argmin(measured))
+    assert len(measured) - 1 - best == 2, "two without a better one, then it stopped"
+    steps = [x["step"] for x in log if "validation_mm" in x]
+    assert [p.name for p in (tmp_path / "best").iterdir() if p.name.isdigit()] == [str(steps[best])]
+    assert max(x["step"] for x in log) < 40 * 5
+    # Asked again, it does no step more.
+    train(config, data, tmp_path)
+    assert len(read_metrics(tmp_path)) == len(log)
+    with pytest.raises(FormatError, match="aren't among"):
+        train(dataclasses.replace(config, validation=("c",)), data, tmp_path / "c", steps=1)
+    assert list((tmp_path / "events").iterdir()), "TensorBoard can show it"
+
+
+def test_lines_of_steps_that_will_be_done_again_do_not_count(tmp_path):
+    lines = [{"step": s, "validation_mm": v} for s, v in ((4, 3.0), (8, 2.0), (12, 1.0))]
+    (tmp_path / "metrics.jsonl").write_text(
+        "\n".join(json.dumps(x) for x in lines) + '\n{"step": 16, "vali'
+    )
+    assert read_metrics(tmp_path) == lines
+    watch = Validation(lines, 8, 2)
+    assert watch.best == 2.0 and not watch.exhausted
+    assert [watch.update(2.5), watch.update(2.1)] == [False, False] and watch.exhausted
+    assert watch.update(1.9) and not watch.exhausted
+
+
+def test_a_discriminator_that_wins_or_guesses_raises_the_alarm():
+    for accuracy, alarm in ((1.0, 1.0), (0.75, 0.0), (0.5, 1.0)):
+        players = Players()
+        for _ in range(100):
+            seen = players.update({"discriminator_accuracy": accuracy})
+        assert seen["gan_alarm"] == alarm
+        assert seen["discriminator_accuracy_mean"] == pytest.approx(accuracy)
+    assert Players().update({"l1": 1.0}) == {}
+
+
+def test_bfloat16_learns_nearly_as_fast(tmp_path):
+    last = {}
+    for precision in ("float32", "bfloat16"):
+        config = dataclasses.replace(CONFIG, precision=precision, adversarial=True)
+        values = []
+        train(
+            config,
+            [sequence()],
+            tmp_path / precision,
+            steps=40,
+            report=lambda a, b, m, v=values: v.append(m["l1"]),
+        )
+        last[precision] = values[-1]
+    assert last["bfloat16"] == pytest.approx(last["float32"], rel=0.25)
+    assert last["bfloat16"] != last["float32"], "it isn't the same arithmetic"
+
+
+def test_pictures_of_maps_show_zero_as_grey():
+    zero, one = np.zeros((4, 4, 3), np.float32), np.ones((4, 4, 3), np.float32)
+    picture = map_picture(zero, one)
+    assert picture.shape == (4, 12, 3)
+    assert (picture[:, :4] == 127).all() and (picture[:, 4:8] == 255).all()
+    assert (picture[:, 8:] == 0).all()

@@ -202,3 +202,97 @@ class Bench:
     """Print nothing but errors."""
     debug: bool = False
     """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Dataset:
+    """Build a dataset of simulated clothes from motion files, or look it over.
+
+    Stopped, the same command goes on where it was; shards may run side by side.
+
+    Examples:
+      physxnet dataset build experiments/configs/dataset_physxnet.py --out runs/ours
+      physxnet dataset build experiments/configs/dataset_blender.py --out runs/b --shard 1/4
+      physxnet dataset check runs/ours --sheet out/ours.png
+    """
+
+    what: tyro.conf.Positional[Literal["build", "check"]]
+    """build: simulate. check: look for explosions, penetration, jitter, wrong counts."""
+    target: tyro.conf.Positional[str]
+    """build: a configuration, a Python file with CONFIG. check: a dataset's folder."""
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """build: the dataset's folder."""
+    mocap: pathlib.Path | None = None
+    """Where ACTIONS.csv and the motion files lie; mocap in $PHYSXNET_DATA or ../shared."""
+    shard: str = "0/1"
+    """build: i/n, every n-th action from the i-th."""
+    only: tuple[str, ...] = ()
+    """build: names of actions."""
+    sheet: pathlib.Path | None = None
+    """check: a contact sheet, .png."""
+    json: pathlib.Path | None = None
+    """check: findings as JSON."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train a network on a dataset.
+
+    Stopped, the same command goes on where it was.
+
+    Examples:
+      physxnet train experiments/configs/local_cpu.py --data runs/ours --out runs/local
+    """
+
+    config: tyro.conf.Positional[str]
+    """A Python file with CONFIG, a TrainConfig."""
+    data: tyro.conf.UseAppendAction[tuple[pathlib.Path, ...]]
+    """Folders of datasets."""
+    out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
+    """The run's folder: checkpoints, metrics.jsonl, TensorBoard events, weights."""
+    splits: tuple[str, ...] = ("train",)
+    """Parts of the datasets that are learned from."""
+    steps: int | None = None
+    """Stop after this many steps in all."""
+    name: str | None = None
+    """Name of the weights; the configuration's file name."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluate:
+    """The error of methods on every action of a dataset, beside what each costs.
+
+    Methods: lbs, nearest, mlp, draft, standard, fine, noise, names of weights, folders of
+    weights or of runs. With +push after a network's name its vertices are pushed out of
+    the body.
+
+    Examples:
+      physxnet evaluate local local+push lbs --data runs/ours --out out/errors.json
+      physxnet evaluate lbs nearest mlp draft noise --data runs/ours --split test
+    """
+
+    methods: tyro.conf.Positional[tuple[str, ...]]
+    """What is measured."""
+    data: pathlib.Path
+    """A dataset's folder: what is measured against."""
+    split: str = "test"
+    """train, test or extra."""
+    learn_from: pathlib.Path | None = None
+    """Dataset that nearest and mlp learn from; the same one."""
+    templates: tuple[Literal["top", "bottom", "dress"], ...] = ("top", "bottom", "dress")
+    """Garments."""
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Rows as JSON; tables (.md) and two charts (_vertices.png, _texels.png) beside it.
+    Rows that are there already are kept."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""

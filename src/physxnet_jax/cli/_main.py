@@ -9,7 +9,19 @@ import tyro
 from rich.console import Console
 
 from ..errors import BrokenInstallError, PhysXNetError
-from ._commands import Bench, Clips, Demo, Doctor, Dress, Effects, Simulate, Stress
+from ._commands import (
+    Bench,
+    Clips,
+    Dataset,
+    Demo,
+    Doctor,
+    Dress,
+    Effects,
+    Evaluate,
+    Simulate,
+    Stress,
+    Train,
+)
 from ._doctor import doctor
 from ._progress import progress_bars
 
@@ -22,6 +34,9 @@ _Command = (
     | Annotated[Effects, tyro.conf.subcommand("effects")]
     | Annotated[Bench, tyro.conf.subcommand("bench")]
     | Annotated[Stress, tyro.conf.subcommand("stress")]
+    | Annotated[Dataset, tyro.conf.subcommand("dataset")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
 )
 
 
@@ -54,15 +69,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Console(stderr=True, soft_wrap=True).print(f"physxnet: {error}", style="red", markup=False)
         return 2
     except KeyboardInterrupt:
-        left = "what is done is kept for the next run" if isinstance(command, Simulate) else ""
+        goes_on = isinstance(command, Simulate | Dataset | Train | Evaluate)
+        left = "what is done is kept for the next run" if goes_on else ""
         Console(stderr=True).print(f"physxnet: stopped; {left or 'nothing half-written is left'}.")
         return 130
 
 
 def _run(
-    command: Dress | Demo | Doctor | Clips | Simulate | Effects | Bench | Stress,
+    command: Dress
+    | Demo
+    | Doctor
+    | Clips
+    | Simulate
+    | Effects
+    | Bench
+    | Stress
+    | Dataset
+    | Train
+    | Evaluate,
     console: Console,
 ) -> int:
+    if isinstance(command, Dataset | Train | Evaluate):
+        return _experiment(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Bench):
         from ._bench import bench
 
@@ -95,6 +123,20 @@ def _run(
         jobs = Dress("walk", out=out / "demo.usdc", preview=out / "demo.mp4", **common)
         return _dress(jobs, console, still=out / "demo.png")
     return _dress(command, console)
+
+
+def _experiment(command: Dataset | Train | Evaluate, console: Console) -> int:
+    if isinstance(command, Dataset):
+        from ._dataset import dataset
+
+        return dataset(command, console)
+    if isinstance(command, Train):
+        from ._train import train
+
+        return train(command, console)
+    from ._evaluate import evaluate
+
+    return evaluate(command, console)
 
 
 def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) -> int:

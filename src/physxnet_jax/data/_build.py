@@ -1,84 +1,139 @@
-"""Building a dataset: every action, every template, through the simulator."""
+"""Building a dataset: every action, every template, through a simulator."""
 
 import pathlib
+import time
 from collections.abc import Callable
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..garment import TEMPLATES, Template, template
-from ..motion import Motion, animate
-from ..simulation import XPBD, PreparedScene, Scene, prepare_scene, simulate_batch
-from ._protocol import Action, load_action
-from ._store import write_action, write_offsets
+from ..garment import template
+from ..motion import Motion, animate, at_speed, mirrored
+from ..simulation import PreparedScene, Scene, prepare_scene, simulate_batch
+from ..simulation.blender import simulate_blender
+from ._config import CARD, DatasetConfig
+from ._protocol import FPS, Action, load_action, read_protocol
+from ._store import (
+    QUANTUM,
+    is_stored,
+    log_build,
+    open_dataset,
+    write_action,
+    write_garment,
+    write_offsets,
+)
 
 
 def build_dataset(
+    config: DatasetConfig,
     root: str | pathlib.Path,
     folder: str | pathlib.Path,
-    actions: list[Action],
     *,
-    templates: tuple[Template, ...] = TEMPLATES,
-    solver: XPBD | None = None,
+    shard: tuple[int, int] = (0, 1),
+    only: tuple[str, ...] = (),
     report: Callable[[str, int, int], None] | None = None,
 ) -> int:
     """Simulates actions and stores the cloth relative to its skinning.
 
-    What is already there is kept, so a build that was stopped goes on where it was.
+    What is already there is kept, so a build that was stopped goes on where it was, and
+    several shards may be built side by side into one folder.
 
     Args:
+        config: What to build.
         root: Where the dataset goes.
-        folder: Where the motion files lie.
-        actions: What to simulate.
-        templates: Garments.
-        solver: Settings of the solver.
+        folder: Where the motion files and ``ACTIONS.csv`` lie.
+        shard: ``(i, n)``: every n-th action from the i-th.
+        only: Names of actions; all of them if empty.
         report: Called with a text, jobs done and jobs in all.
 
     Returns:
         Number of garments simulated now.
+
+    Raises:
+        FormatError: Another dataset lies at ``root``.
+        MotionError: No protocol in ``folder``.
     """
     root = pathlib.Path(root)
-    solver = XPBD() if solver is None else solver
-    jobs = [(t, a) for t in templates for a in actions]
+    actions = [a for a in read_protocol(folder) if a.split in config.splits]
+    actions = [a for a in actions if not only or a.name in only]
+    open_dataset(root, _note(config))
+    jobs = [(t, a) for t in config.templates for a in actions[shard[0] :: shard[1]]]
     done = 0
     prepared: tuple[str, PreparedScene] | None = None
     for k, (name, action) in enumerate(jobs):
-        target = root / action.slug
         if report is not None:
             report(f"{action.name}, {name}", k, len(jobs))
-        if (target / name / "meta.json").is_file():
+        target = root / action.slug
+        if is_stored(target, name):
             continue
-        motion = load_action(folder, action)
-        write_action(target, motion, action.split)
         if prepared is None or prepared[0] != name:
+            # Programs of the garment before are of no more use.
+            jax.clear_caches()
             prepared = (name, prepare_scene(Scene((template(name),))))
         scene = prepared[1]
-        rollout = simulate_batch(scene, [motion], solver=solver)[0]
-        offsets = rollout.positions[0] - skinned_cloth(scene, motion)
-        worst = {key: float(np.max(v)) for key, v in rollout.diagnostics.items() if key != "finite"}
-        if not np.isfinite(offsets).all() or np.abs(offsets).max() > 3.0:
-            # It stays on record as failed; one explosion doesn't stop a build.
-            offsets = np.zeros_like(offsets)
-            failed = True
-        else:
-            failed = not rollout.finite.all()
-        write_offsets(
-            target,
-            name,
-            offsets,
-            {
-                "engine": "physxnet_jax XPBD",
-                "substeps": solver.substeps,
-                "queries": solver.queries,
-                "fps": motion.fps,
-                "finite": not failed,
-                "worst": worst,
-            },
-        )
+        assembly = scene.assembly
+        write_garment(root, name, assembly.rest, np.asarray(assembly.faces))
+        _simulate(config, target, name, action, scene, pathlib.Path(folder))
         done += 1
     if report is not None:
         report("done", len(jobs), len(jobs))
     return done
+
+
+def _note(config: DatasetConfig) -> dict[str, Any]:
+    return {
+        "format": 2,
+        "fps": FPS,
+        "unit": "m",
+        "quantum": QUANTUM,
+        "values": "cloth minus its linear blend skinning, world axes, Y up",
+        "splits": list(config.splits),
+        "templates": list(config.templates),
+        "mirror": config.mirror,
+        "speed": config.speed,
+        **config.settings(),
+        **CARD,
+    }
+
+
+def _simulate(
+    config: DatasetConfig,
+    target: pathlib.Path,
+    name: str,
+    action: Action,
+    scene: PreparedScene,
+    folder: pathlib.Path,
+) -> None:
+    motion = load_action(folder, action)
+    if config.mirror:
+        motion = mirrored(scene.assembly.body, motion)
+    if config.speed != 1.0:
+        motion = at_speed(motion, config.speed)
+    write_action(target, motion, action.split)
+    began = time.perf_counter()
+    if config.engine == "blender":
+        rollout = simulate_blender(Scene((template(name),)), motion, settings=config.blender)  # pyright: ignore[reportArgumentType]
+    else:
+        rollout = simulate_batch(scene, [motion], solver=config.solver)[0]
+    seconds = time.perf_counter() - began
+    offsets = rollout.positions[0] - skinned_cloth(scene, motion)
+    times = ("finite", "milliseconds")
+    worst = {k: float(np.max(v)) for k, v in rollout.diagnostics.items() if k not in times}
+    finite = bool(np.isfinite(offsets).all() and rollout.finite.all())
+    if not np.isfinite(offsets).all() or np.abs(offsets).max() > 3.0:
+        # It stays on record as failed; one explosion doesn't stop a build.
+        offsets = np.zeros_like(offsets)
+        finite = False
+    write_offsets(
+        target,
+        name,
+        offsets,
+        {**config.settings(), "fps": motion.fps, "finite": finite, "worst": worst},
+    )
+    line = {"action": action.name, "template": name, "frames": motion.num_frames}
+    log_build(target.parent, line | {"seconds": round(seconds, 2)})
 
 
 def skinned_cloth(scene: PreparedScene, motion: Motion) -> np.ndarray:

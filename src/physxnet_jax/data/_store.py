@@ -1,6 +1,12 @@
-"""Simulated actions on disk: zarr arrays through tensorstore, one folder an action."""
+"""Simulated actions on disk: zarr arrays through tensorstore, one folder an action.
+
+``dataset.json`` tells what the set is, ``garments/`` holds each garment once, and every
+action's folder the motion and an array for each garment. The body follows from the motion.
+"""
 
 import dataclasses
+import functools
+import hashlib
 import json
 import os
 import pathlib
@@ -9,13 +15,19 @@ from typing import Any
 
 import numpy as np
 import tensorstore as ts
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..errors import FormatError
+from ..files import whole_file
 from ..motion import Motion, load_motion, save_motion
+from ._codec import Codec, make_codec
 
 # Offsets are stored as whole tenths of a millimetre: the error is at most 0.05 mm.
 QUANTUM = 1e-4
+_LARGEST = 3.2
+_NOTE = "dataset.json"
+# Times differ from run to run: they are no part of what a dataset is.
+_LOG = "build_log.jsonl"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +40,7 @@ class Sequence:
         motion: The body's motion.
         offsets: For each template, cloth minus its linear blend skinning [m], shape
             [frames, vertices, 3].
-        meta: What else was noted: engine, settings, diagnostics.
+        meta: What else was noted of each: engine, settings, diagnostics.
     """
 
     name: str
@@ -36,6 +48,72 @@ class Sequence:
     motion: Motion
     offsets: dict[str, Float[np.ndarray, "frames vertices 3"]]
     meta: dict[str, Any]
+
+
+def open_dataset(root: str | pathlib.Path, note: dict[str, Any]) -> None:
+    """Begins a dataset, or makes sure that the one there is the same.
+
+    Raises:
+        FormatError: Another dataset lies there.
+    """
+    path = pathlib.Path(root) / _NOTE
+    text = json.dumps(note, indent=1, sort_keys=True)
+    if path.is_file():
+        if json.loads(path.read_text()) != json.loads(text):
+            raise FormatError(
+                f"{root}: a dataset of another configuration lies there. Choose another"
+                " folder or delete it."
+            )
+        return
+    with whole_file(path) as part:
+        part.write_text(text)
+
+
+def read_note(root: str | pathlib.Path) -> dict[str, Any]:
+    """What a dataset says of itself.
+
+    Raises:
+        FormatError: There is none.
+    """
+    path = pathlib.Path(root) / _NOTE
+    if not path.is_file():
+        raise FormatError(f"{root}: no {_NOTE}, not a dataset; build one first.")
+    return json.loads(path.read_text())
+
+
+def write_garment(
+    root: str | pathlib.Path,
+    name: str,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+) -> None:
+    """Stores a garment at rest [m] and how its offsets are coded, once."""
+    path = pathlib.Path(root) / "garments" / f"{name}.npz"
+    if path.is_file():
+        return
+    codec = make_codec(vertices, faces)
+    with whole_file(path) as part:
+        np.savez_compressed(
+            part,
+            vertices=np.asarray(vertices, np.float32),
+            faces=np.asarray(faces, np.int32),
+            order=codec.order.astype(np.int16),
+            parents=codec.parents.astype(np.int16),
+            weights=codec.weights.astype(np.int16),
+        )
+
+
+@functools.lru_cache(maxsize=8)
+def _codec(path: pathlib.Path, changed: int) -> Codec:
+    with np.load(path) as data:
+        return Codec(*(data[k].astype(np.int64) for k in ("order", "parents", "weights")))
+
+
+def _codec_of(folder: pathlib.Path, template: str) -> Codec:
+    path = folder.parent / "garments" / f"{template}.npz"
+    if not path.is_file():
+        raise FormatError(f"{path}: missing; the garment of {folder.name}/{template}.")
+    return _codec(path.absolute(), path.stat().st_mtime_ns)
 
 
 def write_offsets(
@@ -48,65 +126,98 @@ def write_offsets(
 
     Args:
         folder: The action's folder.
-        template: Name of the garment.
+        template: Name of the garment; `write_garment` stored it.
         offsets: Cloth minus skinning [m].
-        meta: Noted beside the array.
+        meta: Noted as attributes of the array.
 
     Raises:
         FormatError: An offset beyond the 3.2 m that can be stored: an explosion.
     """
     whole = np.round(offsets / QUANTUM)
-    if not np.isfinite(whole).all() or np.abs(whole).max() > 32000:
+    if not np.isfinite(whole).all() or np.abs(whole).max() > _LARGEST / QUANTUM:
         raise FormatError(
-            f"{folder.name}/{template}: cloth is more than 3.2 m from the body or not"
+            f"{folder.name}/{template}: cloth is more than {_LARGEST} m from the body or not"
             " finite; simulate it again with more substeps."
         )
+    left = _codec_of(folder, template).encode(whole.astype(np.int64))
     part = folder / f".{template}.part"
     shutil.rmtree(part, ignore_errors=True)
     store = ts.open(
         {
             "driver": "zarr3",
-            "kvstore": {"driver": "file", "path": str(part / "offsets")},
+            "kvstore": {"driver": "file", "path": str(part)},
             "metadata": {
-                "shape": list(whole.shape),
-                "data_type": "int16",
+                "shape": list(left.shape),
+                "data_type": "uint32",
                 "chunk_grid": {
                     "name": "regular",
-                    "configuration": {"chunk_shape": [min(64, whole.shape[0]), *whole.shape[1:]]},
+                    "configuration": {"chunk_shape": list(left.shape)},
                 },
                 "codecs": [
                     {"name": "bytes", "configuration": {"endian": "little"}},
-                    {"name": "zstd", "configuration": {"level": 12}},
+                    {
+                        "name": "blosc",
+                        "configuration": {
+                            "cname": "zstd",
+                            "clevel": 9,
+                            "shuffle": "shuffle",
+                            "typesize": 4,
+                        },
+                    },
                 ],
-                "attributes": {"unit": "m", "quantum": QUANTUM},
+                "attributes": {
+                    **meta,
+                    "unit": "m",
+                    "quantum": QUANTUM,
+                    "frames": len(offsets),
+                    "sha256": hashlib.sha256(left.tobytes()).hexdigest(),
+                },
             },
         },
         create=True,
     ).result()
-    store.write(whole.astype(np.int16)).result()
-    (part / "meta.json").write_text(json.dumps(meta, indent=1, sort_keys=True))
+    store.write(left).result()
     final = folder / template
     shutil.rmtree(final, ignore_errors=True)
     os.replace(part, final)
 
 
 def read_offsets(folder: pathlib.Path, template: str) -> Float[np.ndarray, "frames vertices 3"]:
-    """Offsets [m] of one garment of one action."""
+    """Offsets [m] of one garment of one action.
+
+    Raises:
+        FormatError: Damaged.
+    """
     store = ts.open(
-        {
-            "driver": "zarr3",
-            "kvstore": {"driver": "file", "path": str(folder / template / "offsets")},
-        },
+        {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(folder / template)}},
         read=True,
     ).result()
-    return np.asarray(store.read().result(), dtype=np.float32) * np.float32(QUANTUM)
+    left = np.ascontiguousarray(store.read().result())
+    if hashlib.sha256(left.tobytes()).hexdigest() != read_meta(folder, template)["sha256"]:
+        raise FormatError(
+            f"{folder.name}/{template}: the checksum is wrong; delete that folder and build"
+            " the dataset again, only this part will be simulated."
+        )
+    whole = _codec_of(folder, template).decode(left)
+    return whole.astype(np.float32) * np.float32(QUANTUM)
+
+
+def read_meta(folder: pathlib.Path, template: str) -> dict[str, Any]:
+    """What was noted of one garment of one action."""
+    return json.loads((folder / template / "zarr.json").read_text())["attributes"]
+
+
+def is_stored(folder: pathlib.Path, template: str) -> bool:
+    """Whether a garment of an action is there."""
+    return (folder / template / "zarr.json").is_file()
 
 
 def write_action(folder: pathlib.Path, motion: Motion, split: str) -> None:
     """The motion of an action and what split it is in."""
     folder.mkdir(parents=True, exist_ok=True)
     save_motion(folder / "motion.npz", motion)
-    (folder / "action.json").write_text(json.dumps({"name": motion.name, "split": split}))
+    with whole_file(folder / "action.json") as part:
+        part.write_text(json.dumps({"name": motion.name, "split": split}))
 
 
 def read_sequence(folder: str | pathlib.Path) -> Sequence:
@@ -121,13 +232,13 @@ def read_sequence(folder: str | pathlib.Path) -> Sequence:
         raise FormatError(f"{folder}: no action.json, not an action of a dataset.")
     info = json.loads(note.read_text())
     motion = load_motion(folder / "motion.npz")
-    found = sorted(p.parent.name for p in folder.glob("*/meta.json"))
+    found = sorted(p.parent.name for p in folder.glob("*/zarr.json"))
     return Sequence(
         info["name"],
         info["split"],
         Motion(motion.rotations, motion.root, motion.fps, info["name"]),
         {name: read_offsets(folder, name) for name in found},
-        {name: json.loads((folder / name / "meta.json").read_text()) for name in found},
+        {name: read_meta(folder, name) for name in found},
     )
 
 
@@ -138,3 +249,26 @@ def list_sequences(root: str | pathlib.Path, split: str | None = None) -> list[p
         if split is None or json.loads(note.read_text())["split"] == split:
             out.append(note.parent)
     return out
+
+
+def log_build(root: str | pathlib.Path, line: dict[str, Any]) -> None:
+    """Adds a line to the log of a build: what took how long."""
+    with (pathlib.Path(root) / _LOG).open("a") as file:
+        file.write(json.dumps(line) + "\n")
+
+
+def read_log(root: str | pathlib.Path) -> list[dict[str, Any]]:
+    """The log of a build."""
+    path = pathlib.Path(root) / _LOG
+    return [json.loads(x) for x in path.read_text().splitlines()] if path.is_file() else []
+
+
+def dataset_digest(root: str | pathlib.Path) -> tuple[str, int]:
+    """Checksum of all that a dataset is (times apart), and its bytes."""
+    root = pathlib.Path(root)
+    total, size = hashlib.sha256(), 0
+    for path in sorted(p for p in root.rglob("*") if p.is_file() and p.name != _LOG):
+        blob = path.read_bytes()
+        size += len(blob)
+        total.update(f"{path.relative_to(root)} {hashlib.sha256(blob).hexdigest()}\n".encode())
+    return total.hexdigest(), size

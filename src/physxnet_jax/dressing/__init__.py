@@ -10,6 +10,7 @@ from ._dress import (
     unbound_wearable as unbound_wearable,
 )
 from ._meshes import animated_meshes as animated_meshes
+from ._method import pushed_network as pushed_network
 from ._push_out import (
     SkinPatch as SkinPatch,
     make_patch as make_patch,

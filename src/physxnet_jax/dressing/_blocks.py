@@ -12,11 +12,16 @@ from jaxtyping import Array, Float
 
 from ..body import Body
 from ..garment import Garment
-from ..models import WINDOW, Predictor, Wearable, dress_frames, skin_wearable
+from ..models import Predictor, Wearable, dress_frames, skin_wearable
 from ..motion import BLOCK, Motion, padded_block
 from ..simulation import Scene, prepare_scene, simulate_batch, standard_effects
 from ._push_out import SkinPatch, push_out, skin_height
 from ._stages import Stage
+
+
+def lead_frames(predictor: Predictor | None) -> int:
+    """Frames before the first one that a method has to see."""
+    return 0 if predictor is None else predictor.config.inputs.window - 1
 
 
 @functools.partial(jax.jit, static_argnames=("fps", "resolve"))
@@ -30,7 +35,7 @@ def dress_block(
     resolve: bool,
 ) -> tuple[tuple[Array, Array], ...]:
     """Garments of a block of frames and the share of vertices inside before push-out."""
-    last = slice(WINDOW - 1, None)
+    last = slice(lead_frames(predictor), None)
     r, t = rotations[last], translations[last]
     if predictor is None:
         raw = tuple(jax.vmap(lambda a, b, w=w: skin_wearable(w, a, b))(r, t) for w in wearables)
@@ -57,6 +62,7 @@ def predict_clip(
     stages: list[Stage],
     progress: Callable[[str, int, int], None] | None,
 ) -> dict[str, Any]:
+    lead = lead_frames(predictor)
     name = "network" if predictor is not None else "skinning"
     frames = len(world)
     blocks, times = [], []
@@ -66,8 +72,8 @@ def predict_clip(
             predictor,
             tuple(wearables),
             tuple(patches),
-            jnp.asarray(padded_block(world, start, WINDOW - 1)),
-            jnp.asarray(padded_block(shift, start, WINDOW - 1)),
+            jnp.asarray(padded_block(world, start, lead)),
+            jnp.asarray(padded_block(shift, start, lead)),
             fps,
             resolve,
         )

@@ -1,5 +1,11 @@
 """Metrics and reports: what an answer is worth, and what holds where it is hard."""
 
+from ._baselines import (
+    nearest_frame as nearest_frame,
+    pose_features as pose_features,
+    pose_network as pose_network,
+    training_frames as training_frames,
+)
 from ._bench import (
     JITTER as JITTER,
     BenchScene as BenchScene,
@@ -9,7 +15,26 @@ from ._bench import (
     solvers as solvers,
     time_to_error as time_to_error,
 )
+from ._dataset_check import check_sequence as check_sequence
+from ._evaluate import ActionError as ActionError, evaluate as evaluate, means as means
+from ._methods import (
+    NOISE as NOISE,
+    Answer as Answer,
+    Blockwise as Blockwise,
+    Method as Method,
+    Simulator as Simulator,
+    network as network,
+    rest_and_skin as rest_and_skin,
+    skinning as skinning,
+)
 from ._metrics import VertexError as VertexError, vertex_error as vertex_error
+from ._motion_metrics import (
+    acceleration_error as acceleration_error,
+    area_strain as area_strain,
+    dihedral_angles as dihedral_angles,
+    jitter as jitter,
+    wrinkle_error as wrinkle_error,
+)
 from ._penetration import Penetration as Penetration, penetration as penetration
 from ._price import (
     Advice as Advice,
@@ -20,6 +45,7 @@ from ._price import (
 from ._strain import edge_strain as edge_strain
 from ._stress import CASES as CASES, Finding as Finding, run_case as run_case
 from ._stress_worn import PEER_CASES as PEER_CASES, run_peer as run_peer
+from ._tables import error_tables as error_tables, summary_table as summary_table
 from ._textile import (
     DRAPE_BANDS as DRAPE_BANDS,
     Cantilever as Cantilever,

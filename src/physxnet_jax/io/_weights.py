@@ -17,6 +17,7 @@ from ..body import load_body
 from ..errors import WeightsError
 from ..files import whole_file
 from ..models import (
+    Inputs,
     ModelConfig,
     Normalisation,
     Predictor,
@@ -109,6 +110,12 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
         ) from error
 
 
+def _model(card: dict[str, Any]) -> ModelConfig:
+    return ModelConfig(
+        **{**card, "templates": tuple(card["templates"]), "inputs": Inputs(**card["inputs"])}
+    )
+
+
 def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
     card = json.loads((folder / _CARD).read_text())
     blob = (folder / _TENSORS).read_bytes()
@@ -119,7 +126,7 @@ def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
             " the file is damaged. Reinstall or copy it again."
         )
     tensors = load_tensors(blob)
-    model = ModelConfig(**{**card["model"], "templates": tuple(card["model"]["templates"])})
+    model = _model(card["model"])
     atlas = make_atlas(model.resolution)
     if atlas.digest() != card["atlas"]:
         raise WeightsError(

@@ -2,10 +2,10 @@
 
 from ._blocks import depth_to_space as depth_to_space, upsampling_kernel as upsampling_kernel
 from ._features import (
-    WINDOW as WINDOW,
+    PAPER as PAPER,
     Family as Family,
+    Inputs as Inputs,
     clip_features as clip_features,
-    num_channels as num_channels,
     skin_points as skin_points,
 )
 from ._networks import Discriminator as Discriminator, Generator as Generator

@@ -1,5 +1,6 @@
-"""Motion as the network sees it: texel velocities and accelerations of three frames."""
+"""Motion as the network sees it: texel velocities and accelerations of some frames."""
 
+import dataclasses
 from typing import Literal
 
 import jax
@@ -11,15 +12,64 @@ from ..geometry import polar_rotation
 from ..uv import acceleration_maps, velocity_maps
 
 Family = Literal["paper", "local"]
-WINDOW = 5
-"""Poses needed for one answer: accelerations of three frames reach four frames back."""
 
 _EXACT = jax.lax.Precision.HIGHEST
 
 
-def num_channels(family: Family) -> int:
-    """Input channels: six of each of three frames, and gravity for ``local``."""
-    return 18 if family == "paper" else 21
+@dataclasses.dataclass(frozen=True)
+class Inputs:
+    """Which maps of the body's motion a network sees.
+
+    Attributes:
+        family: ``paper``: in the world's frame; ``local``: in each texel's own frame,
+            the rotation nearest to its skinning.
+        frames: Frames k - (frames - 1) stride, ..., k - stride, k are seen.
+        stride: Frames from one to the next.
+        acceleration: Accelerations beside velocities.
+        gravity: The direction of gravity (``local`` only: elsewhere it is constant).
+        place: Where the texel lies from the middle of the body (``local`` only): from
+            it the pose can be told, of which velocities know nothing.
+    """
+
+    family: Family = "local"
+    frames: int = 3
+    stride: int = 1
+    acceleration: bool = True
+    gravity: bool = True
+    place: bool = True
+
+    def __post_init__(self) -> None:
+        if self.frames < 1 or self.stride < 1:
+            raise ValueError(f"{self}: frames and stride must be at least 1.")
+
+    @property
+    def window(self) -> int:
+        """Poses needed for one answer; an acceleration reaches two frames back."""
+        return (self.frames - 1) * self.stride + 3
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of channels in their order, three or three times ``frames`` each."""
+        local = self.family == "local"
+        return (
+            "velocity",
+            *(["acceleration"] if self.acceleration else []),
+            *(["gravity"] if self.gravity and local else []),
+            *(["place"] if self.place and local else []),
+        )
+
+    @property
+    def channels(self) -> int:
+        """Channels in all: 18 for the paper's."""
+        return sum(self.width(kind) for kind in self.kinds)
+
+    def width(self, kind: str) -> int:
+        """Channels of a kind."""
+        return 3 * self.frames if kind in ("velocity", "acceleration") else 3
+
+
+PAPER = Inputs("paper")
+"""The paper's: velocities and accelerations of three frames in the world's frame."""
 
 
 def skin_points(
@@ -40,27 +90,25 @@ def clip_features(
     rotations: Float[Array, "padded joints 3 3"],
     translations: Float[Array, "padded joints 3"],
     fps: float,
-    family: Family,
+    inputs: Inputs,
 ) -> Float[Array, "frames texels channels"]:
     """Features of successive frames, each point skinned once.
 
-    Channels: velocities [m/s] of frames k-2, k-1, k, accelerations [m/s^2] of the
-    same, and for ``local`` the direction of gravity. ``paper`` gives them in the
-    world's frame, ``local`` in each texel's own frame at k: the rotation nearest to its
-    skinning. Turning the person about the vertical axis leaves ``local`` features
-    as they are.
+    Turning the person about the vertical axis leaves ``local`` features as they are.
 
     Args:
         rest: Texel points at rest [m].
         weights: Their skinning weights.
-        rotations: World rotations of joints of all frames, with four frames before the
-            first one wanted; repeat the first frame there at a clip's start.
+        rotations: World rotations of joints of all frames, with ``inputs.window - 1``
+            frames before the first one wanted; repeat the first frame there at a
+            clip's start.
         translations: World translations of joints [m], likewise.
         fps: Frames a second.
-        family: Which features.
+        inputs: Which features.
 
     Returns:
-        Features of every covered texel; four frames fewer than poses.
+        Features of every covered texel: velocities [m/s], oldest first, accelerations
+        [m/s^2], gravity's direction, place [m].
 
     References:
         PhysXNet, section 3.1: X = (I_v, I_a) of frames k-2 to k.
@@ -68,16 +116,21 @@ def clip_features(
     points, blends = jax.vmap(skin_points, in_axes=(None, None, 0, 0))(
         rest, weights, rotations, translations
     )
-    velocity = velocity_maps(points, fps)
-    acceleration = acceleration_maps(points, fps)
-    frames = rotations.shape[0] - (WINDOW - 1)
-    both = jnp.stack(
-        [x[2 + k : 2 + k + frames] for x in (velocity, acceleration) for k in range(3)],
-        axis=2,
-    )
-    if family == "paper":
-        return both.reshape(frames, rest.shape[0], 18)
-    frame = polar_rotation(blends[WINDOW - 1 :])
+    lead = inputs.window - 1
+    frames = rotations.shape[0] - lead
+    back = [lead - inputs.stride * k for k in range(inputs.frames - 1, -1, -1)]
+    moved = [velocity_maps(points, fps)]
+    if inputs.acceleration:
+        moved.append(acceleration_maps(points, fps))
+    both = jnp.stack([x[k : k + frames] for x in moved for k in back], axis=2)
+    if inputs.family == "paper":
+        return both.reshape(frames, rest.shape[0], -1)
+    frame = polar_rotation(blends[lead:])
     turned = jnp.einsum("fpba,fpkb->fpka", frame, both, precision=_EXACT)
-    gravity = -frame[:, :, 1, :]
-    return jnp.concatenate([turned.reshape(frames, rest.shape[0], 18), gravity], axis=2)
+    out = [turned.reshape(frames, rest.shape[0], -1)]
+    if inputs.gravity:
+        out.append(-frame[:, :, 1, :])
+    if inputs.place:
+        away = points[lead:] - jnp.mean(points[lead:], axis=1, keepdims=True)
+        out.append(jnp.einsum("fpba,fpb->fpa", frame, away, precision=_EXACT))
+    return jnp.concatenate(out, axis=2)

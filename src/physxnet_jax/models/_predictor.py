@@ -14,7 +14,7 @@ from ..garment import Garment
 from ..geometry import Stencil, gaussian_stencil, polar_rotation
 from ..typing import pytree
 from ..uv import Atlas, Binding, dress_body
-from ._features import WINDOW, Family, clip_features, num_channels, skin_points
+from ._features import Family, Inputs, clip_features, skin_points
 from ._networks import Generator
 
 _EXACT = jax.lax.Precision.HIGHEST
@@ -28,16 +28,21 @@ class ModelConfig:
     """Everything that decides what a network is.
 
     Attributes:
-        family: ``paper`` (world frame) or ``local`` (each texel's own frame).
+        inputs: What it sees of the motion, and in which frame it answers.
         resolution: Texels a side, a multiple of 16.
         width: Channels of the first layer.
         templates: Templates with a decoder.
     """
 
-    family: Family = "local"
+    inputs: Inputs = dataclasses.field(default_factory=Inputs)
     resolution: int = 128
     width: int = 32
     templates: tuple[str, ...] = ("top", "bottom", "dress")
+
+    @property
+    def family(self) -> Family:
+        """``paper`` (world frame) or ``local`` (each texel's own frame)."""
+        return self.inputs.family
 
 
 @pytree
@@ -144,9 +149,9 @@ class Predictor:
             rotations,
             translations,
             fps,
-            self.config.family,
+            self.config.inputs,
         )
-        features = normalise(features, self.normalisation, self.config.family)
+        features = normalise(features, self.normalisation, self.config.inputs)
         return self.from_features(features, templates)
 
     def from_features(
@@ -170,21 +175,21 @@ class Predictor:
 def normalise(
     features: Float[Array, "*batch texels channels"],
     normalisation: Normalisation,
-    family: Family,
+    inputs: Inputs,
 ) -> Float[Array, "*batch texels channels"]:
     """Features scaled to about [-1, 1], each kind by itself (PhysXNet, section 5.1)."""
-    ones = jnp.ones((9,), jnp.float32)
-    scale = [ones / normalisation.velocity, ones / normalisation.acceleration]
-    if family == "local":
-        scale.append(jnp.ones((3,), jnp.float32))
-    row = jnp.concatenate(scale)
+    one = jnp.ones((), jnp.float32)
+    scales = {"velocity": normalisation.velocity, "acceleration": normalisation.acceleration}
+    row = jnp.concatenate(
+        [jnp.full((inputs.width(k),), one / scales.get(k, one)) for k in inputs.kinds]
+    )
     return features * row.reshape((1,) * (features.ndim - 1) + (-1,))
 
 
 def make_generator(config: ModelConfig, *, seed: int = 0) -> Generator:
     """A generator with fresh parameters."""
     return Generator(
-        num_channels(config.family),
+        config.inputs.channels,
         config.templates,
         width=config.width,
         rngs=nnx.Rngs(seed),
@@ -311,8 +316,8 @@ def dress_frames(
     Args:
         predictor: The network.
         wearables: What is worn.
-        rotations: World rotations of joints, with four frames before the first one
-            wanted (see `pad_clip`).
+        rotations: World rotations of joints, with ``config.inputs.window - 1`` frames
+            before the first one wanted (see `pad_clip`).
         translations: World translations of joints [m], likewise.
         fps: Frames a second.
 
@@ -322,7 +327,7 @@ def dress_frames(
     templates = tuple(dict.fromkeys(w.template for w in wearables))
     offsets = predictor(rotations, translations, fps, templates)
     family: Family = predictor.config.family
-    last = slice(WINDOW - 1, None)
+    last = slice(predictor.config.inputs.window - 1, None)
     return tuple(
         jax.vmap(lambda r, t, o, w=w: place_sampled(w, r, t, o, family))(
             rotations[last], translations[last], w.sample(offsets[w.template])
@@ -331,15 +336,15 @@ def dress_frames(
     )
 
 
-def pad_clip(values: Float[Array, "frames ..."]) -> Float[Array, "padded ..."]:
-    """A clip with its first frame repeated four times before itself."""
-    return jnp.concatenate([jnp.repeat(values[:1], WINDOW - 1, axis=0), values])
+def pad_clip(values: Float[Array, "frames ..."], inputs: Inputs) -> Float[Array, "padded ..."]:
+    """A clip with its first frame repeated before itself, as often as ``inputs`` need."""
+    return jnp.concatenate([jnp.repeat(values[:1], inputs.window - 1, axis=0), values])
 
 
 def pose_windows(
-    values: Float[Array, "frames ..."] | Float[np.ndarray, "frames ..."],
+    values: Float[Array, "frames ..."] | Float[np.ndarray, "frames ..."], inputs: Inputs
 ) -> Float[Array, "frames window ..."] | Float[np.ndarray, "frames window ..."]:
-    """The last five frames up to each frame; the first one is repeated before itself."""
+    """The last poses up to each frame; the first one is repeated before itself."""
     frames = values.shape[0]
-    index = np.arange(frames)[:, None] + np.arange(1 - WINDOW, 1)[None]
+    index = np.arange(frames)[:, None] + np.arange(1 - inputs.window, 1)[None]
     return values[np.maximum(index, 0)]

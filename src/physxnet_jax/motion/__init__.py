@@ -27,3 +27,4 @@ from ._transforms import (
     clip_transforms as clip_transforms,
     padded_block as padded_block,
 )
+from ._variants import at_speed as at_speed, mirror_joints as mirror_joints, mirrored as mirrored

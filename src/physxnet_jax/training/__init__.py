@@ -15,4 +15,10 @@ from ._losses import (
     masked_l1 as masked_l1,
     soft_labels as soft_labels,
 )
-from ._step import ClothTables as ClothTables, TrainState as TrainState, make_step as make_step
+from ._step import (
+    ClothTables as ClothTables,
+    Steps as Steps,
+    TrainState as TrainState,
+    make_step as make_step,
+)
+from ._watch import map_picture as map_picture, read_metrics as read_metrics

@@ -14,7 +14,9 @@ from ..errors import FormatError
 from ..garment import Garment
 from ..geometry import polar_rotation
 from ..models import (
+    PAPER,
     Family,
+    Inputs,
     Normalisation,
     Surface,
     clip_features,
@@ -66,7 +68,7 @@ def load_frames(
     garments: dict[str, Garment],
     body: Body,
     rest: Float[Array, "all 3"],
-    family: Family,
+    inputs: Inputs,
 ) -> Frames:
     """Windows of poses and cloth targets of all sequences.
 
@@ -87,8 +89,8 @@ def load_frames(
     usable: dict[str, list] = {t: [] for t in garments}
     for s in sequences:
         world, shift = clip_transforms(body, rest, s.motion)
-        rotations.append(np.asarray(pose_windows(world)))
-        translations.append(np.asarray(pose_windows(shift)))
+        rotations.append(np.asarray(pose_windows(world, inputs)))
+        translations.append(np.asarray(pose_windows(shift, inputs)))
         for name, g in garments.items():
             have = name in s.offsets and usable_garment(s.meta[name])
             usable[name].append(np.full(len(world), have))
@@ -96,7 +98,7 @@ def load_frames(
                 targets[name].append(np.zeros((len(world), g.num_vertices, 3), dtype=np.int16))
                 continue
             offset = s.offsets[name]
-            if family == "local":
+            if inputs.family == "local":
                 offset = _to_local(g, world, offset)
             targets[name].append(np.round(offset / _QUANTUM).astype(np.int16))
     cat = np.concatenate
@@ -202,16 +204,18 @@ def measure_normalisation(
         otherwise squeeze every other motion into a few per cent of the range.
     """
     pick = np.random.default_rng(seed).choice(len(frames), min(samples, len(frames)), False)
-    look = jax.jit(clip_features, static_argnames=("fps", "family"))
+    look = jax.jit(clip_features, static_argnames=("fps", "inputs"))
+    # Lengths don't depend on the frame they are told in.
+    seen = dataclasses.replace(PAPER, frames=1)
     rows = [
         np.abs(
             look(
                 surface.rest,
                 surface.weights,
-                frames.rotations[i],
-                frames.translations[i],
+                frames.rotations[i, -seen.window :],
+                frames.translations[i, -seen.window :],
                 fps=frames.fps,
-                family="paper",
+                inputs=seen,
             )[0]
         )
         for i in pick
@@ -222,7 +226,7 @@ def measure_normalisation(
         return jnp.asarray(max(float(np.quantile(x, 0.999)), 1e-6), jnp.float32)
 
     return Normalisation(
-        scale(features[..., :9]),
-        scale(features[..., 9:18]),
+        scale(features[..., :3]),
+        scale(features[..., 3:6]),
         {t: scale(np.abs(np.asarray(o))) for t, o in offsets_of.items()},
     )

@@ -1,6 +1,7 @@
 """What a training run is."""
 
 import dataclasses
+from typing import Literal
 
 from ..models import ModelConfig
 
@@ -15,11 +16,18 @@ class TrainConfig:
         batch: Frames a step.
         learning_rate: Adam's rate for the generator.
         discriminator_rate: Adam's rate for the discriminator.
-        schedule: ``constant`` (the paper) or ``cosine`` (to zero over the run).
+        momentum: Adam's b1; 0.5 is usual beside a discriminator.
+        schedule: ``constant`` (the paper) or ``cosine`` (up over the first 2 % of the
+            run, down to zero over the rest).
         l1_weight: lambda_L1 of equation 2.
         adversarial: Whether there is a discriminator at all.
         discriminator_width: Channels of its first layer.
         seed: Of everything random.
+        precision: Of the network's arithmetic; parameters and losses stay float32.
+        validation: Names of training actions that are kept from training and measured
+            instead; the weights that did best on them are the result.
+        validate_every: Steps between such measurements.
+        patience: Stop after this many measurements without a better one.
         checkpoint_every: Steps between checkpoints.
         max_skipped: Non-finite updates in a row before the run gives up.
     """
@@ -29,10 +37,15 @@ class TrainConfig:
     batch: int = 8
     learning_rate: float = 2e-4
     discriminator_rate: float = 2e-4
-    schedule: str = "constant"
+    momentum: float = 0.5
+    schedule: Literal["constant", "cosine"] = "constant"
     l1_weight: float = 100.0
     adversarial: bool = True
     discriminator_width: int = 16
     seed: int = 0
+    precision: Literal["float32", "bfloat16"] = "float32"
+    validation: tuple[str, ...] = ()
+    validate_every: int = 400
+    patience: int = 10
     checkpoint_every: int = 200
     max_skipped: int = 20

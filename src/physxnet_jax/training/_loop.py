@@ -27,7 +27,8 @@ from ._batches import (
 )
 from ._checkpoint import Checkpoints, config_json
 from ._config import TrainConfig
-from ._step import ClothTables, TrainState, make_step
+from ._step import ClothTables, Steps, TrainState, make_step
+from ._watch import METRICS, Board, Players, Validation, read_metrics
 
 
 def prepare_surface(model: ModelConfig) -> tuple[Atlas, Surface, dict[str, ClothTables]]:
@@ -81,24 +82,40 @@ def train(
     rest = body.rest_vertices(body.default_shape())
     atlas, surface, tables = prepare_surface(config.model)
     garments = {t: template(t) for t in config.model.templates}  # pyright: ignore[reportArgumentType]
-    frames = load_frames(sequences, garments, body, rest, config.model.family)
+    held = _held_out(config, sequences)
+    used = [s for s in sequences if s.name not in config.validation]
+    frames = load_frames(used, garments, body, rest, config.model.inputs)
+    unseen = load_frames(held, garments, body, rest, config.model.inputs) if held else None
     normalisation = _normalisation(config, frames, surface, tables)
     per_epoch = max(len(frames) // config.batch, 1)
     total = per_epoch * config.epochs
     stop = total if steps is None else min(steps, total)
-    state, step, graph = make_step(config, atlas, surface, normalisation, tables, frames.fps, total)
+    run = make_step(config, atlas, surface, normalisation, tables, frames.fps, total)
     _same_run(folder / "config.json", config_json(config, frames.identity))
     checkpoints = Checkpoints(folder / "checkpoints")
-    restored = checkpoints.latest(state)
-    state = state if restored is None else restored
+    best_kept = Checkpoints(folder / "best", keep=1)
+    restored = checkpoints.latest(run.first)
+    state = run.first if restored is None else restored
     done = int(state.step)
+    watch = Validation(read_metrics(folder), done, config.patience)
+    players = Players()
     key = jax.random.key(config.seed)
+    board = Board(folder)
     began = time.perf_counter()
     try:
-        with (folder / "metrics.jsonl").open("a") as log:
-            while done < stop:
+        with (folder / METRICS).open("a") as log:
+
+            def note(values: dict[str, float]) -> None:
+                values |= {"step": done, "seconds": round(time.perf_counter() - began, 3)}
+                log.write(json.dumps(values) + "\n")
+                log.flush()
+                board.write(values, done)
+                if report is not None:
+                    report(done, stop, values)
+
+            while done < stop and not watch.exhausted:
                 index = batch_indices(len(frames), config.batch, config.seed, done)
-                state, metrics = step(state, take(frames, index), jax.random.fold_in(key, done))
+                state, metrics = run.step(state, take(frames, index), jax.random.fold_in(key, done))
                 done += 1
                 skipped = max(
                     int(state.generator_opt.notfinite_count),
@@ -109,20 +126,61 @@ def train(
                         f"step {done}: {skipped} updates in a row were not finite. Lower the"
                         " learning rate or look for NaN in the data."
                     )
-                if done % 20 == 0 or done == stop:
+                last = done == stop
+                if done % 20 == 0 or last:
                     values = {k: float(v) for k, v in metrics.items()}
-                    values |= {"step": done, "seconds": time.perf_counter() - began}
-                    log.write(json.dumps(values) + "\n")
-                    log.flush()
-                    if report is not None:
-                        report(done, stop, values)
+                    note(values | players.update(values))
+                if unseen is not None and (done % config.validate_every == 0 or last):
+                    losses, shown = _validate(config, run, state, unseen)
+                    if watch.update(losses["validation_mm"]):
+                        best_kept.save(state, {"step": done, **losses})
+                    note(losses)
+                    board.show(shown, done)
                 if done % config.checkpoint_every == 0:
                     checkpoints.save(state, {"step": done})
     finally:
+        board.close()
         if restored is None or int(restored.step) != int(state.step):
             checkpoints.save(state, {"step": int(state.step)})
         checkpoints.close()
-    return make_predictor(config.model, atlas, surface, normalisation, state, graph)
+    best = best_kept.latest(run.first) if unseen is not None else None
+    best_kept.close()
+    chosen = state if best is None else best
+    return make_predictor(config.model, atlas, surface, normalisation, chosen, run.graph)
+
+
+def _held_out(config: TrainConfig, sequences: Items[Sequence]) -> list[Sequence]:
+    names = {s.name for s in sequences}
+    missing = [n for n in config.validation if n not in names]
+    if missing:
+        raise FormatError(
+            f"validation actions {', '.join(missing)} aren't among the sequences:"
+            f" {', '.join(sorted(names)) or 'none'}."
+        )
+    return [s for s in sequences if s.name in config.validation]
+
+
+def _validate(
+    config: TrainConfig, run: Steps, state: TrainState, frames: Frames
+) -> tuple[dict[str, float], dict[str, tuple[np.ndarray, np.ndarray]]]:
+    """Mean absolute errors [mm] on what isn't trained on, and maps of the middle."""
+    sums = dict.fromkeys(config.model.templates, 0.0)
+    weights = dict.fromkeys(config.model.templates, 0.0)
+    shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    # Neighbouring frames tell the same.
+    order = np.arange(0, len(frames), 3)
+    for start in range(0, len(order), config.batch):
+        index = np.resize(order[start : start + config.batch], config.batch)
+        batch = take(frames, index)
+        losses, maps = run.look(state, batch)
+        for t, value in losses.items():
+            count = float(batch[f"weight_{t}"].sum())
+            sums[t] += count * float(value)
+            weights[t] += count
+        if start <= len(order) // 2 < start + config.batch:
+            shown = {t: (np.asarray(a[0]), np.asarray(b[0])) for t, (a, b) in maps.items()}
+    each = {f"validation_mm_{t}": sums[t] / max(weights[t], 1.0) for t in sums}
+    return {"validation_mm": float(np.mean(list(each.values()))), **each}, shown
 
 
 def _same_run(path: pathlib.Path, text: str) -> None:

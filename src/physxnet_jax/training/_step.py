@@ -1,5 +1,6 @@
 """One training step: discriminator, then generator, as one jitted function."""
 
+import contextlib
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -17,13 +18,14 @@ from ..models import (
     clip_features,
     make_generator,
     normalise,
-    num_channels,
 )
 from ..typing import pytree
 from ..uv import Atlas, Transference
 from ._batches import target_offsets
 from ._config import TrainConfig
 from ._losses import adversarial_loss, discriminator_loss, masked_l1, soft_labels
+
+Batch = dict[str, Any]
 
 
 @pytree
@@ -73,12 +75,30 @@ class ClothTables:
 def make_optimiser(config: TrainConfig, rate: float, steps: int) -> optax.GradientTransformation:
     """Adam as in the paper; updates that aren't finite are skipped and counted."""
     schedule = (
-        optax.cosine_decay_schedule(rate, max(steps, 1))
+        optax.warmup_cosine_decay_schedule(0.0, rate, max(steps // 50, 1), max(steps, 2))
         if config.schedule == "cosine"
         else optax.constant_schedule(rate)
     )
     # The loop gives up after max_skipped; the optimiser itself must never let one in.
-    return optax.apply_if_finite(optax.adam(schedule, b1=0.5), 2**31 - 2)
+    return optax.apply_if_finite(optax.adam(schedule, b1=config.momentum), 2**31 - 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class Steps:
+    """A run's functions, all jitted.
+
+    Attributes:
+        first: The state before the first step.
+        step: From a state, a batch and a key to the next state and metrics.
+        look: From a state and a batch to the loss of the network as it would be used,
+            and its maps: predicted and wanted offsets [m] for each template.
+        graph: Structure of the generator.
+    """
+
+    first: TrainState
+    step: Callable[[TrainState, Batch, Key[Array, ""]], tuple[TrainState, dict[str, Array]]]
+    look: Callable[[TrainState, Batch], tuple[dict[str, Array], dict[str, tuple[Array, Array]]]]
+    graph: Any
 
 
 def make_step(
@@ -89,14 +109,14 @@ def make_step(
     tables: dict[str, ClothTables],
     fps: float,
     steps: int,
-) -> tuple[TrainState, Callable[[TrainState, dict, Key[Array, ""]], tuple[TrainState, dict]], Any]:
-    """The first state, the step function and the generator's graph."""
-    family, templates = config.model.family, config.model.templates
+) -> Steps:
+    """The first state and the functions of a run."""
+    inputs, templates = config.model.inputs, config.model.templates
     g_graph, g_params, g_rest = nnx.split(
         make_generator(config.model, seed=config.seed), nnx.Param, ...
     )
     judge = Discriminator(
-        num_channels(family) + 3 * len(templates),
+        inputs.channels + 3 * len(templates),
         width=config.discriminator_width,
         rngs=nnx.Rngs(config.seed + 1),
     )
@@ -113,35 +133,46 @@ def make_step(
         jnp.zeros((), jnp.int32),
     )
 
-    def generate(params: Any, rest: Any, x: Array) -> tuple[dict[str, Array], Any]:
-        network = nnx.merge(g_graph, params, rest, copy=True)
-        network.train()
-        out = network(x, templates)
+    dtype = jnp.dtype(config.precision)
+
+    def lower(tree: Any) -> Any:
+        return jax.tree.map(lambda v: v.astype(dtype), tree)
+
+    def generate(
+        params: Any, rest: Any, x: Array, training: bool = True
+    ) -> tuple[dict[str, Array], Any]:
+        network = nnx.merge(g_graph, lower(params), rest, copy=True)
+        if training:
+            network.train()
+        else:
+            network.eval()
+        with _mixed():
+            out = network(x.astype(dtype), templates)
         return {t: m.astype(jnp.float32) for t, m in out.items()}, nnx.state(
             network, nnx.Not(nnx.Param)
         )
 
     def judge_maps(params: Any, rest: Any, x: Array, y: Array) -> tuple[Array, Any]:
-        network = nnx.merge(d_graph, params, rest, copy=True)
+        network = nnx.merge(d_graph, lower(params), rest, copy=True)
         network.train()
-        return network(x, y), nnx.state(network, nnx.Not(nnx.Param))
+        with _mixed():
+            out = network(x.astype(dtype), y.astype(dtype))
+        return out.astype(jnp.float32), nnx.state(network, nnx.Not(nnx.Param))
 
     def stack(maps: dict[str, Array], masks: dict[str, Array]) -> Array:
         return jnp.concatenate([maps[t] * masks[t] for t in templates], axis=-1)
 
-    @jax.jit
-    def step(
-        state: TrainState, batch: dict[str, Array], key: Key[Array, ""]
-    ) -> tuple[TrainState, dict]:
+    def prepare(batch: Batch) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+        """Motion maps, wanted offsets at texels over their scale, and what counts."""
         features = jax.vmap(clip_features, in_axes=(None, None, 0, 0, None, None))(
             surface.rest,
             surface.weights,
             batch["rotations"],
             batch["translations"],
             fps,
-            family,
+            inputs,
         )
-        x = atlas.to_map(normalise(features[:, 0], normalisation, family))
+        x = atlas.to_map(normalise(features[:, 0], normalisation, inputs))
         targets, masks = {}, {}
         for t in templates:
             c = tables[t]
@@ -154,12 +185,34 @@ def make_step(
                 c.anchor_weights,
                 batch["rotations"][:, -1],
                 batch["translations"][:, -1],
-                family,
+                inputs.family,
             )
             targets[t] = meters / normalisation.offset[t]
             seen = surface.valid[t].astype(jnp.float32)[None, :, None]
             weight = batch[f"weight_{t}"][:, None, None]
             masks[t] = atlas.to_map(seen * weight)
+        return x, targets, masks
+
+    @jax.jit
+    def look(
+        state: TrainState, batch: Batch
+    ) -> tuple[dict[str, Array], dict[str, tuple[Array, Array]]]:
+        x, targets, masks = prepare(batch)
+        maps, _ = generate(state.generator, state.generator_rest, x, training=False)
+        losses, shown = {}, {}
+        for t in templates:
+            scale = normalisation.offset[t]
+            weight = batch[f"weight_{t}"]
+            l1 = masked_l1(atlas.from_map(maps[t]), targets[t], surface.valid[t], weight)
+            losses[t] = 1e3 * l1 * scale
+            shown[t] = (maps[t] * masks[t] * scale, atlas.to_map(targets[t]) * masks[t] * scale)
+        return losses, shown
+
+    @jax.jit
+    def step(
+        state: TrainState, batch: Batch, key: Key[Array, ""]
+    ) -> tuple[TrainState, dict[str, Array]]:
+        x, targets, masks = prepare(batch)
         real = stack({t: atlas.to_map(v) for t, v in targets.items()}, masks)
 
         def generator_loss(params: Any) -> tuple[Array, tuple]:
@@ -226,7 +279,12 @@ def make_step(
         new = TrainState(g_params, g_rest, d_params, d_rest, g_opt, d_opt, state.step + 1)
         return new, metrics
 
-    return state, step, g_graph
+    return Steps(state, step, look, g_graph)
+
+
+def _mixed() -> contextlib.AbstractContextManager[Any]:
+    """Batch statistics stay float32, whatever the network computes in."""
+    return jax.numpy_dtype_promotion("standard")
 
 
 def _update(tx: optax.GradientTransformation, grads: Any, state: Any, params: Any) -> Any:

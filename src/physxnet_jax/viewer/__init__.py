@@ -1,6 +1,6 @@
 """Looking at results: pictures and videos."""
 
-from ._diagram import draw_work_precision as draw_work_precision
+from ._diagram import draw_bars as draw_bars, draw_work_precision as draw_work_precision
 from ._render import (
     PREVIEWS as PREVIEWS,
     check_preview as check_preview,

@@ -58,3 +58,47 @@ def draw_work_precision(
     with whole_file(path) as part:
         figure.savefig(part, dpi=120, format="png")
     return path
+
+
+def draw_bars(
+    path: str | pathlib.Path, bars: Sequence[tuple[str, str, str, float]], label: str
+) -> pathlib.Path:
+    """Bars of every method side by side for every action, a panel for each garment.
+
+    Args:
+        path: A PNG file.
+        bars: Panel, action, method and value.
+        label: Of the values' axis.
+
+    Raises:
+        MissingDependencyError: matplotlib isn't installed.
+    """
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Charts need matplotlib: pip install 'physxnet-jax[render]'."
+        ) from error
+    panels = list(dict.fromkeys(b[0] for b in bars))
+    methods = list(dict.fromkeys(b[2] for b in bars))
+    figure = Figure(figsize=(11.0, 3.2 * max(len(panels), 1)), layout="constrained")
+    FigureCanvasAgg(figure)
+    for k, panel in enumerate(panels):
+        axes = figure.add_subplot(len(panels), 1, k + 1)
+        mine = {(a, m): v for p, a, m, v in bars if p == panel}
+        actions = list(dict.fromkeys(a for a, _ in mine))
+        width = 0.8 / len(methods)
+        for i, method in enumerate(methods):
+            have = [(j, mine[a, method]) for j, a in enumerate(actions) if (a, method) in mine]
+            if have:
+                at, values = zip(*have, strict=True)
+                axes.bar([j + (i + 0.5) * width - 0.4 for j in at], values, width, label=method)
+        axes.set(title=panel, ylabel=label)
+        axes.set_xticks(range(len(actions)), actions, rotation=20, ha="right", fontsize=8)
+        axes.grid(True, axis="y", alpha=0.3)
+        axes.legend(fontsize=7, ncols=min(len(methods), 6))
+    path = pathlib.Path(path)
+    with whole_file(path) as part:
+        figure.savefig(part, dpi=110, format="png")
+    return path

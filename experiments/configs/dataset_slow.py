@@ -1,0 +1,10 @@
+"""The 22 training actions at four fifths of their speed, mirrored, through our simulator.
+
+Command: physxnet dataset build experiments/configs/dataset_slow.py --out runs/slow
+Cost:    about 10 minutes on two cores.
+Result:  the same poses with other velocities: what depends on which can be told apart.
+"""
+
+from physxnet_jax.data import DatasetConfig
+
+CONFIG = DatasetConfig(engine="physxnet", splits=("train",), speed=0.8)

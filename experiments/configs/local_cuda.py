@@ -1,0 +1,24 @@
+"""The `local` network at full size, for one CUDA machine.
+
+Command: physxnet train experiments/configs/local_cuda.py --name local --data runs/ours
+         --data runs/mirror --data runs/slow --out runs/local_cuda
+Cost:    not measured yet, see experiments/gpu_queue.md.
+Result:  what more texels, channels and epochs are worth.
+"""
+
+from physxnet_jax.models import Inputs, ModelConfig
+from physxnet_jax.training import TrainConfig
+
+CONFIG = TrainConfig(
+    model=ModelConfig(Inputs("local"), resolution=128, width=64),
+    epochs=60,
+    batch=16,
+    learning_rate=2e-3,
+    schedule="cosine",
+    adversarial=False,
+    precision="bfloat16",
+    validation=("kick ball",),
+    validate_every=1000,
+    patience=20,
+    checkpoint_every=1000,
+)

@@ -1,0 +1,145 @@
+"""`physxnet evaluate`: errors of methods on every action, as rows, tables and charts."""
+
+import dataclasses
+import json
+import pathlib
+from collections.abc import Mapping
+
+from rich.console import Console
+from rich.table import Table
+
+from ..data import list_sequences, read_sequence
+from ..dressing import pushed_network
+from ..errors import FormatError, PhysXNetError
+from ..evaluation import (
+    NOISE,
+    ActionError,
+    Method,
+    Simulator,
+    error_tables,
+    evaluate as measure,
+    means,
+    nearest_frame,
+    network,
+    pose_network,
+    skinning,
+    summary_table,
+    training_frames,
+)
+from ..files import whole_file
+from ..io import load_predictor
+from ..simulation import ACCURACY
+from ..viewer import draw_bars
+from ._commands import Evaluate
+from ._progress import progress_bars
+
+
+def evaluate(command: Evaluate, console: Console) -> int:
+    """Measures row by row; each is kept as soon as it is there."""
+    if command.out is not None and command.out.suffix != ".json":
+        raise FormatError(f"{command.out}: rows are written as .json.")
+    folders = list_sequences(command.data, command.split)
+    if not folders:
+        raise FormatError(f"{command.data}: no '{command.split}' actions; build a dataset first.")
+    rows = _read(command.out)
+    sequences = [read_sequence(f) for f in folders]
+    methods = {name: _method(name, command) for name in command.methods}
+    with progress_bars(console) as progress:
+        for row in measure(
+            methods,
+            sequences,
+            templates=command.templates,
+            done=rows,
+            report=lambda text, k, n: progress("rows", k, n),
+        ):
+            rows.append(row)
+            if command.out is not None:
+                _write(command.out, rows)
+    for engine in dict.fromkeys(r.engine for r in rows):
+        console.print(_summary(rows, engine))
+    if command.out is not None:
+        with whole_file(command.out.with_suffix(".md")) as part:
+            part.write_text(summary_table(rows) + "\n" + error_tables(rows))
+        stem = command.out.with_suffix("")
+        for what in ("vertices", "texels"):
+            draw_bars(
+                stem.with_name(f"{stem.name}_{what}.png"),
+                [
+                    (
+                        f"{r.template} ({r.engine})",
+                        r.action,
+                        r.method,
+                        getattr(r, f"rmse_{what}_mm"),
+                    )
+                    for r in rows
+                ],
+                f"RMSE over {what} [mm]",
+            )
+        console.print(f"wrote {command.out}, .md and two charts", highlight=False)
+    return 0
+
+
+def _panel(row: ActionError) -> str:
+    return f"{row.template} ({row.engine})"
+
+
+def _read(path: pathlib.Path | None) -> list[ActionError]:
+    if path is None or not path.is_file():
+        return []
+    return [ActionError(**row) for row in json.loads(path.read_text())]
+
+
+def _write(path: pathlib.Path, rows: list[ActionError]) -> None:
+    with whole_file(path) as part:
+        part.write_text(json.dumps([_rounded(r) for r in rows], indent=1) + "\n")
+
+
+def _rounded(row: ActionError) -> Mapping[str, object]:
+    return {
+        k: float(f"{v:.5g}") if isinstance(v, float) else v
+        for k, v in dataclasses.asdict(row).items()
+    }
+
+
+def _method(name: str, command: Evaluate) -> Method:
+    if name == "lbs":
+        return skinning()
+    if name in ACCURACY:
+        return Simulator(name)
+    if name == "noise":
+        return Simulator("standard", moved=NOISE)
+    if name in ("nearest", "mlp"):
+        root = command.learn_from or command.data
+        known = training_frames(
+            [read_sequence(f) for f in list_sequences(root, "train")], command.templates
+        )
+        return nearest_frame(known) if name == "nearest" else pose_network(known)
+    weights = name.removesuffix("+push")
+    run = pathlib.Path(weights) / "weights"
+    predictor = load_predictor(run if run.is_dir() else weights)
+    missing = set(command.templates) - set(predictor.config.templates)
+    if missing:
+        raise PhysXNetError(
+            f"{name} has no decoder for {', '.join(sorted(missing))}; name --templates it has."
+        )
+    return pushed_network(predictor) if name.endswith("+push") else network(predictor)
+
+
+def _summary(rows: list[ActionError], engine: str) -> Table:
+    table = Table(title=f"Means over actions, reference: {engine}")
+    for column in ("method", "template", "RMSE mm", "inside %", "wrinkles deg", "ms a frame"):
+        left = column in ("method", "template")
+        table.add_column(column, justify="left" if left else "right")
+    for method in dict.fromkeys(r.method for r in rows):
+        for name in dict.fromkeys(r.template for r in rows):
+            m = means(rows, method, name, engine)
+            if m is not None:
+                table.add_row(
+                    method,
+                    name,
+                    f"{m['rmse_vertices_mm']:.1f}",
+                    f"{100 * m['penetration_share']:.2f}",
+                    f"{m['wrinkle_deg']:.1f}",
+                    f"{m['ms_per_frame']:.1f}",
+                )
+    return table

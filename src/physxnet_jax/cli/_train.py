@@ -1,0 +1,60 @@
+"""`physxnet train`: a network from a configuration and datasets."""
+
+import pathlib
+
+from rich.console import Console
+
+from ..data import CARD, list_sequences, read_note, read_sequence
+from ..io import save_predictor
+from ..training import TrainConfig, read_metrics, train as run
+from ._commands import Train
+from ._configs import read_config
+from ._progress import progress_bars
+
+
+def train(command: Train, console: Console) -> int:
+    """Trains, or goes on; leaves the weights in the run's folder."""
+    config = read_config(command.config, TrainConfig)
+    sequences = [
+        read_sequence(folder)
+        for root in command.data
+        for split in command.splits
+        for folder in list_sequences(root, split)
+    ]
+    with progress_bars(console) as progress:
+
+        def report(done: int, total: int, values: dict[str, float]) -> None:
+            progress("steps", done, total)
+            if "validation_mm" in values:
+                console.print(
+                    f"step {done}: validation {values['validation_mm']:.2f} mm", highlight=False
+                )
+
+        predictor = run(config, sequences, command.out, steps=command.steps, report=report)
+    log = read_metrics(command.out)
+    alarms = sum(line.get("gan_alarm", 0.0) for line in log)
+    notes = [read_note(root) for root in command.data]
+    card = {
+        **CARD,
+        "data": [
+            {k: n[k] for k in ("engine", "splits", "fps", "quantum") if k in n} for n in notes
+        ],
+        "training": {
+            "actions": len(sequences),
+            "frames": sum(s.motion.num_frames for s in sequences),
+            "steps": int(log[-1]["step"]) if log else 0,
+            "adversarial": config.adversarial,
+            "seed": config.seed,
+            "gan_alarms": int(alarms),
+            "updates_skipped": int(max((x.get("skipped", 0.0) for x in log), default=0)),
+        },
+    }
+    name = command.name or pathlib.Path(command.config).stem
+    save_predictor(command.out / "weights", predictor, name=name, card=card)
+    console.print(f"wrote {command.out / 'weights'}", highlight=False)
+    if alarms:
+        console.print(
+            f"{alarms:.0f} of {len(log)} log lines have gan_alarm set: discriminator and generator"
+            " were out of balance there; compare with adversarial=False."
+        )
+    return 0

@@ -1,0 +1,43 @@
+"""What a dataset is made of."""
+
+import dataclasses
+from typing import Any, Literal
+
+from ..garment import TEMPLATES, Template
+from ..simulation import XPBD
+from ..simulation.blender import BlenderSettings
+
+CARD: dict[str, Any] = {
+    "licence": "The motion is the CMU Graphics Lab Motion Capture Database's, free for all uses"
+    " but not to be sold; what is derived here from it is MIT.",
+    "acknowledgement": "The data used in this project was obtained from mocap.cs.cmu.edu. The"
+    " database was created with funding from NSF EIA-0196217.",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class DatasetConfig:
+    """Settings of a dataset.
+
+    Attributes:
+        engine: ``physxnet`` (this package's simulator) or ``blender`` (the paper's).
+        splits: Of the protocol: ``train``, ``test``, ``extra``.
+        templates: Garments, each simulated by itself.
+        mirror: Left and right of every motion are exchanged.
+        speed: Every motion is played this many times as fast.
+        solver: Settings of our simulator.
+        blender: Settings of Blender's.
+    """
+
+    engine: Literal["physxnet", "blender"] = "physxnet"
+    splits: tuple[str, ...] = ("train", "test")
+    templates: tuple[Template, ...] = TEMPLATES
+    mirror: bool = False
+    speed: float = 1.0
+    solver: XPBD = dataclasses.field(default_factory=XPBD)
+    blender: BlenderSettings = dataclasses.field(default_factory=BlenderSettings)
+
+    def settings(self) -> dict[str, Any]:
+        """What the engine is told, and nothing of the other one."""
+        used = self.solver if self.engine == "physxnet" else self.blender
+        return {"engine": self.engine, **dataclasses.asdict(used)}

@@ -1,0 +1,172 @@
+"""Baselines that learn from the training set: the nearest frame, and a net of the pose."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence as Items
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+from ..body import Body, load_body
+from ..data import Sequence
+from ..garment import Template, template
+from ..models import Inputs
+from ..training import Frames, load_frames
+from ._methods import Blockwise, place_local, rest_and_skin
+
+_QUANTUM = 1e-4
+_HIDDEN = 512
+_BATCH = 64
+
+
+def pose_features(
+    rotations: Float[Array, "frames joints 3 3"], parents: tuple[int, ...]
+) -> Float[Array, "frames features"]:
+    """What a pose is, wherever the person stands and whichever way they face.
+
+    Rotations of joints relative to their parents, and the direction of gravity in the
+    frame of the first joint.
+
+    Args:
+        rotations: World rotations.
+        parents: Parent of each joint, -1 for the first.
+    """
+    up = jnp.asarray([max(p, 0) for p in parents], dtype=jnp.int32)
+    relative = jnp.einsum("fjba,fjbc->fjac", rotations[:, up], rotations)
+    inner = jnp.asarray([j for j, p in enumerate(parents) if p >= 0], dtype=jnp.int32)
+    joints = relative[:, inner].reshape(len(rotations), -1)
+    return jnp.concatenate([joints, -rotations[:, 0, 1, :]], axis=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Known:
+    """A template's cloth in the training set, in each vertex's own frame."""
+
+    features: np.ndarray
+    offsets: np.ndarray
+
+
+def _known(frames: Frames, body: Body, name: Template) -> _Known:
+    use = frames.usable[name]
+    rotations = jnp.asarray(frames.rotations[use, -1])
+    return _Known(np.asarray(pose_features(rotations, body.parents)), frames.targets[name][use])
+
+
+def training_frames(sequences: Items[Sequence], names: Items[Template]) -> Frames:
+    """Training frames with targets in each vertex's own frame."""
+    body = load_body()
+    rest = body.rest_vertices(body.default_shape())
+    return load_frames(sequences, {t: template(t) for t in names}, body, rest, Inputs("local", 1))
+
+
+def nearest_frame(frames: Frames) -> Blockwise:
+    """The cloth of the training frame whose pose is nearest."""
+    body = load_body()
+
+    def wear(name: Template) -> Any:
+        known = _known(frames, body, name)
+        return (
+            rest_and_skin(name),
+            jnp.asarray(known.features),
+            jnp.asarray(known.offsets),
+        )
+
+    return Blockwise(_nearest, functools.cache(wear))
+
+
+@functools.partial(jax.jit, static_argnames=("fps",))
+def _nearest(worn: Any, r: Array, t: Array, fps: float) -> Array:
+    rest, features, offsets = worn
+    mine = pose_features(r, load_body().parents)
+    gap = jnp.sum((mine[:, None] - features[None]) ** 2, axis=2)
+    found = offsets[jnp.argmin(gap, axis=1)].astype(jnp.float32) * _QUANTUM
+    return place_local(rest, r, t, found)
+
+
+def pose_network(
+    frames: Frames,
+    *,
+    steps: int = 4000,
+    seed: int = 0,
+    report: Callable[[str, int, int], None] | None = None,
+) -> Blockwise:
+    """A perceptron from the pose alone to every vertex's offset, one for each garment.
+
+    Args:
+        frames: What it learns from.
+        steps: Of Adam.
+        seed: Of its parameters and batches.
+        report: Called with a text, steps done and steps in all.
+
+    References:
+        Patel, Liao and Pons-Moll, TailorNet (2020), section 5: its own baseline.
+    """
+    body = load_body()
+
+    def wear(name: Template) -> Any:
+        known = _known(frames, body, name)
+        params, scale = _fit(known, steps, seed, name, report)
+        return rest_and_skin(name), params, scale
+
+    return Blockwise(_ask, functools.cache(wear))
+
+
+def _perceptron(params: list[tuple[Array, Array]], x: Array) -> Array:
+    for w, b in params[:-1]:
+        x = jax.nn.relu(jnp.matmul(x, w) + b[None])
+    w, b = params[-1]
+    return jnp.matmul(x, w) + b[None]
+
+
+@functools.partial(jax.jit, static_argnames=("fps",))
+def _ask(worn: Any, r: Array, t: Array, fps: float) -> Array:
+    rest, params, (mean, deviation) = worn
+    x = (pose_features(r, load_body().parents) - mean[None]) / deviation[None]
+    out = _perceptron(params, x).reshape(len(r), -1, 3)
+    return place_local(rest, r, t, out)
+
+
+def _fit(
+    known: _Known,
+    steps: int,
+    seed: int,
+    name: str,
+    report: Callable[[str, int, int], None] | None,
+) -> tuple[Any, tuple[Array, Array]]:
+    mean = known.features.mean(axis=0)
+    # A joint that hardly turned in training says nothing when it does.
+    deviation = np.maximum(known.features.std(axis=0), 0.05)
+    features = jnp.asarray((known.features - mean) / deviation)
+    offsets = jnp.asarray(known.offsets)
+    sizes = [features.shape[1], _HIDDEN, _HIDDEN, offsets.shape[1] * 3]
+    keys = jax.random.split(jax.random.key(seed), len(sizes))
+    params = [
+        (jax.random.normal(k, (a, b)) * np.float32((2.0 / a) ** 0.5), jnp.zeros((b,)))
+        for k, a, b in zip(keys, sizes[:-1], sizes[1:], strict=False)
+    ]
+    params[-1] = (params[-1][0] * 0.01, params[-1][1])
+    tx = optax.adam(optax.cosine_decay_schedule(1e-3, steps))
+
+    @jax.jit
+    def step(params: Any, state: Any, key: Array) -> tuple[Any, Any]:
+        pick = jax.random.randint(key, (_BATCH,), 0, len(features))
+
+        def loss(p: Any) -> Array:
+            want = offsets[pick].astype(jnp.float32).reshape(_BATCH, -1) * _QUANTUM
+            return jnp.mean(jnp.abs(_perceptron(p, features[pick]) - want))
+
+        grads = jax.grad(loss)(params)
+        with jax.numpy_dtype_promotion("standard"):
+            updates, state = tx.update(grads, state, params)
+        return optax.apply_updates(params, updates), state
+
+    state = tx.init(params)
+    for k in range(steps):
+        params, state = step(params, state, jax.random.fold_in(keys[-1], k))
+        if report is not None and k % 50 == 0:
+            report(f"pose network, {name}", k, steps)
+    return params, (jnp.asarray(mean), jnp.asarray(deviation))

@@ -1,0 +1,199 @@
+"""The error of every action and template: the paper's two figures, and what they miss."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence as Items
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..body import load_body
+from ..data import Sequence
+from ..garment import Template, template
+from ..simulation import Assembly, Scene, prepare_scene
+from ..training import usable_garment
+from ..uv import Transference, garment_map_rows, make_atlas
+from ._methods import Method, skinning
+from ._metrics import vertex_error
+from ._motion_metrics import acceleration_error, area_strain, jitter, wrinkle_error
+from ._penetration import penetration
+from ._strain import edge_strain
+
+# Maps on which errors at texels are taken, whatever a network's own size.
+_RESOLUTION = 128
+# Penetration is looked for in every fifth frame: it takes longer than all else.
+_EVERY = 5
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionError:
+    """One method on one action and template.
+
+    Attributes:
+        engine: What made the reference.
+        method: What is measured.
+        action: Name of the action.
+        template: Name of the garment.
+        frames: Number of frames.
+        mse_texels_mm2: Mean squared distance over valid texels of a 128 x 128 map [mm^2].
+        rmse_texels_mm: Its root [mm].
+        mse_vertices_mm2: Mean squared distance over the template's vertices [mm^2].
+        rmse_vertices_mm: Its root [mm].
+        mean_mm: Mean distance [mm].
+        p95_mm: 95th percentile of distances [mm].
+        max_mm: Largest distance [mm].
+        penetration_share: Share of vertices inside the body that have room outside
+            (every fifth frame).
+        pinched_share: Share inside that have none, see `penetration`.
+        penetration_mm: Deepest of the former [mm].
+        strain_p99: 99th percentile of the absolute strain of edges [1].
+        area_strain_p99: Likewise of triangles' areas [1].
+        wrinkle_deg: See `wrinkle_error` [degrees].
+        acceleration_error: See there [m/s^2].
+        jitter: Mean jerk [m/s^3].
+        jitter_reference: That of the reference.
+        finite_share: Share of frames that are finite; errors are over these.
+        ms_per_frame: From joint rotations to this template's vertices, warm.
+    """
+
+    engine: str
+    method: str
+    action: str
+    template: str
+    frames: int
+    mse_texels_mm2: float
+    rmse_texels_mm: float
+    mse_vertices_mm2: float
+    rmse_vertices_mm: float
+    mean_mm: float
+    p95_mm: float
+    max_mm: float
+    penetration_share: float
+    pinched_share: float
+    penetration_mm: float
+    strain_p99: float
+    area_strain_p99: float
+    wrinkle_deg: float
+    acceleration_error: float
+    jitter: float
+    jitter_reference: float
+    finite_share: float
+    ms_per_frame: float
+
+
+def evaluate(
+    methods: Mapping[str, Method],
+    sequences: Items[Sequence],
+    *,
+    templates: Items[Template],
+    done: Items[ActionError] = (),
+    report: Callable[[str, int, int], None] | None = None,
+) -> Iterator[ActionError]:
+    """Measures methods action by action.
+
+    Args:
+        methods: By name.
+        sequences: Actions with their reference cloth; garments that came off the body
+            there (see `usable_garment`) are left out.
+        templates: Garments to look at.
+        done: Rows that needn't be measured again.
+        report: Called with a text, rows done and rows in all.
+
+    Yields:
+        A row for each method, action and template, as soon as it is known.
+
+    References:
+        PhysXNet, section 5.2 and figures 4 and 5.
+    """
+    known = {(r.engine, r.method, r.action, r.template) for r in done}
+    jobs: list[tuple[Template, str, Sequence]] = [
+        (t, m, s) for t in templates for m in methods for s in sequences if t in s.offsets
+    ]
+    rows = _Reference()
+    for k, (name, label, sequence) in enumerate(jobs):
+        if report is not None:
+            report(f"{label}, {sequence.name}, {name}", k, len(jobs))
+        meta = sequence.meta[name]
+        key = (meta["engine"], label, sequence.name, name)
+        if key in known or not usable_garment(meta):
+            continue
+        yield rows.measure(label, methods[label], sequence, name)
+
+
+class _Reference:
+    """What is the same for every method."""
+
+    def __init__(self) -> None:
+        self._tables: dict[Template, tuple[Assembly, Transference]] = {}
+
+    def tables(self, name: Template) -> tuple[Assembly, Transference]:
+        if name not in self._tables:
+            body = load_body()
+            rest = body.rest_vertices(body.default_shape())
+            scene = prepare_scene(Scene((template(name),)))
+            to_cloth = garment_map_rows(make_atlas(_RESOLUTION), body, rest, template(name))
+            self._tables[name] = (scene.assembly, to_cloth)
+        return self._tables[name]
+
+    def measure(
+        self, label: str, method: Method, sequence: Sequence, name: Template
+    ) -> ActionError:
+        assembly, to_cloth = self.tables(name)
+        motion = sequence.motion
+        reference = skinning()(motion, name).positions + sequence.offsets[name]
+        answer = method(motion, name)
+        finite = np.asarray(np.isfinite(answer.positions).all(axis=(1, 2)))
+        shown = np.where(finite[:, None, None], answer.positions, 0.0)
+        x, y = shown[finite], reference[finite]
+        values: dict[str, Any] = dict.fromkeys(
+            (f.name for f in dataclasses.fields(ActionError)), float("nan")
+        )
+        values |= {
+            "engine": sequence.meta[name]["engine"],
+            "method": label,
+            "action": sequence.name,
+            "template": name,
+            "frames": motion.num_frames,
+            "finite_share": float(finite.mean()),
+            "ms_per_frame": answer.ms_per_frame,
+            "jitter_reference": jitter(reference, motion.fps),
+        }
+        if not len(x):
+            return ActionError(**values)
+        error = vertex_error(x, y)
+        gap = np.asarray(to_cloth @ jnp.asarray(x - y))[:, np.asarray(to_cloth.valid)]
+        texels = float(np.mean(np.sum((1e3 * gap.astype(np.float64)) ** 2, axis=2)))
+        looked = np.flatnonzero(finite)[::_EVERY]
+        inside = penetration(assembly, motion, shown, frames=looked)
+        free = inside.cloth_inside & ~inside.pinched
+        faces = np.asarray(assembly.faces)
+        strain = np.abs(edge_strain(assembly, x))
+        values |= {
+            "mse_texels_mm2": texels,
+            "rmse_texels_mm": texels**0.5,
+            "mse_vertices_mm2": error.mse_mm2,
+            "rmse_vertices_mm": error.rmse_mm,
+            "mean_mm": error.mean_mm,
+            "p95_mm": error.p95_mm,
+            "max_mm": error.max_mm,
+            "penetration_share": float(free.mean()),
+            "pinched_share": float((inside.cloth_inside & inside.pinched).mean()),
+            "penetration_mm": 1e3 * float(np.where(free, inside.depth, 0.0).max()),
+            "strain_p99": float(np.quantile(strain, 0.99)),
+            "area_strain_p99": float(
+                np.quantile(np.abs(area_strain(assembly.rest, faces, x)), 0.99)
+            ),
+            "wrinkle_deg": wrinkle_error(faces, x, y),
+            "acceleration_error": acceleration_error(x, y, motion.fps),
+            "jitter": jitter(x, motion.fps),
+        }
+        return ActionError(**values)
+
+
+def means(rows: Items[ActionError], method: str, name: str, engine: str) -> dict[str, float] | None:
+    """Means over the actions of a method on a template; None if there is no row."""
+    mine = [r for r in rows if (r.method, r.template, r.engine) == (method, name, engine)]
+    if not mine:
+        return None
+    numbers = [f.name for f in dataclasses.fields(ActionError) if f.type is float]
+    return {n: float(np.mean([getattr(r, n) for r in mine])) for n in numbers}

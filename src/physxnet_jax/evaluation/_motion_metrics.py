@@ -1,0 +1,75 @@
+"""How cloth moves and folds: what a mean distance doesn't show."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..geometry import hinges
+
+
+def dihedral_angles(
+    faces: Int[np.ndarray, "faces 3"], positions: Float[np.ndarray, "frames vertices 3"]
+) -> Float[np.ndarray, "frames hinges"]:
+    """Signed angle between the two triangles of every interior edge [rad]."""
+    a, b, left, right = hinges(faces).T
+    x = positions.astype(np.float64)
+    edge = x[:, b] - x[:, a]
+    n1 = np.cross(edge, x[:, left] - x[:, a])
+    n2 = np.cross(x[:, right] - x[:, a], edge)
+    length = np.linalg.norm(edge, axis=2)
+    sine = np.einsum("fhi,fhi->fh", np.cross(n1, n2), edge) / np.maximum(length, 1e-12)
+    return np.arctan2(sine, np.einsum("fhi,fhi->fh", n1, n2))
+
+
+def wrinkle_error(
+    faces: Int[np.ndarray, "faces 3"],
+    positions: Float[np.ndarray, "frames vertices 3"],
+    reference: Float[np.ndarray, "frames vertices 3"],
+) -> float:
+    """Root mean square difference of the angles at the folds [degrees].
+
+    It sees wrinkles that are missing or smoothed away, whatever the mean distance.
+    """
+    gap = dihedral_angles(faces, positions) - dihedral_angles(faces, reference)
+    gap = (gap + np.pi) % (2.0 * np.pi) - np.pi
+    return float(np.degrees(np.sqrt(np.mean(gap**2))))
+
+
+def area_strain(
+    rest: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    positions: Float[np.ndarray, "frames vertices 3"],
+) -> Float[np.ndarray, "frames faces"]:
+    """Change of the area of every triangle over its area at rest [1]."""
+
+    def area(x: np.ndarray) -> np.ndarray:
+        a, b, c = (x[..., faces[:, k], :] for k in range(3))
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=-1)
+
+    return area(positions) / np.maximum(area(rest), 1e-12) - 1.0
+
+
+def acceleration_error(
+    positions: Float[np.ndarray, "frames vertices 3"],
+    reference: Float[np.ndarray, "frames vertices 3"],
+    fps: float,
+) -> float:
+    """Mean length of the difference of accelerations [m/s^2]; 0 below three frames."""
+    if len(positions) < 3:
+        return 0.0
+    gap = positions.astype(np.float64) - reference
+    return float(np.linalg.norm(np.diff(gap, n=2, axis=0), axis=2).mean() * fps**2)
+
+
+def jitter(positions: Float[np.ndarray, "frames vertices 3"], fps: float) -> float:
+    """Mean length of the third derivative of positions, jerk [m/s^3].
+
+    Compare it with that of the reference: a body that moves has some.
+
+    References:
+        Flash and Hogan, The coordination of arm movements (1985), for jerk as the
+        measure of smoothness; TransPose (2021) for its use as jitter.
+    """
+    if len(positions) < 4:
+        return 0.0
+    third = np.diff(positions.astype(np.float64), n=3, axis=0)
+    return float(np.linalg.norm(third, axis=2).mean() * fps**3)

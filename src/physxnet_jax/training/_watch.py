@@ -1,0 +1,124 @@
+"""Watching a run: logs, pictures, early stopping, the balance of the two players."""
+
+import json
+import math
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+METRICS = "metrics.jsonl"
+# A discriminator that is right this often teaches the generator nothing any more.
+_BEATEN = 0.97
+# One this near to guessing has lost itself, or the generator is perfect.
+_GUESSING = 0.52
+# Weight of the newest measurement in the running mean.
+_NEWEST = 0.05
+
+
+def read_metrics(folder: str | pathlib.Path) -> list[dict[str, Any]]:
+    """All lines of a run's ``metrics.jsonl``; a line cut by a kill is dropped."""
+    path = pathlib.Path(folder) / METRICS
+    if not path.is_file():
+        return []
+    out = []
+    for line in path.read_text().splitlines():
+        try:
+            out.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return out
+
+
+class Validation:
+    """The best measurement so far, and whether it is time to stop.
+
+    Args:
+        lines: Of the log; what a run that goes on has measured before.
+        step: Its step: later lines are of steps that will be done again.
+        patience: Measurements without a better one that end the run.
+    """
+
+    def __init__(self, lines: Sequence[Mapping[str, Any]], step: int, patience: int) -> None:
+        self.best, self._since, self._patience = math.inf, 0, patience
+        for line in lines:
+            if "validation_mm" in line and line["step"] <= step:
+                self.update(line["validation_mm"])
+
+    def update(self, value: float) -> bool:
+        """Takes a measurement; whether it is the best so far."""
+        better = value < self.best
+        self.best = min(value, self.best)
+        self._since = 0 if better else self._since + 1
+        return better
+
+    @property
+    def exhausted(self) -> bool:
+        """No better measurement for too long."""
+        return self._since >= self._patience
+
+
+class Players:
+    """Whether generator and discriminator still learn from each other."""
+
+    def __init__(self) -> None:
+        self._accuracy: float | None = None
+
+    def update(self, metrics: Mapping[str, float]) -> dict[str, float]:
+        """Running mean of the discriminator's accuracy, and its alarm.
+
+        ``gan_alarm`` is 1 where the discriminator is nearly always right (its gradient
+        is gone) or as good as guessing (it has collapsed), else 0.
+        """
+        new = metrics.get("discriminator_accuracy")
+        if new is None:
+            return {}
+        old = self._accuracy
+        self._accuracy = new if old is None else (1 - _NEWEST) * old + _NEWEST * new
+        wrong = self._accuracy > _BEATEN or self._accuracy < _GUESSING
+        return {"discriminator_accuracy_mean": self._accuracy, "gan_alarm": float(wrong)}
+
+
+class Board:
+    """TensorBoard events and sample pictures, where tensorboardX is installed.
+
+    Args:
+        folder: The run's folder; events go to ``events`` within.
+    """
+
+    def __init__(self, folder: pathlib.Path) -> None:
+        self._writer: Any = None
+        try:
+            from tensorboardX import SummaryWriter
+        except ImportError:
+            return
+        self._writer = SummaryWriter(str(folder / "events"), write_to_disk=True)
+
+    def write(self, values: Mapping[str, float], step: int) -> None:
+        """Scalars of a step."""
+        if self._writer is not None:
+            for name, value in values.items():
+                if name not in ("step", "seconds"):
+                    self._writer.add_scalar(name, value, step)
+
+    def show(self, maps: Mapping[str, tuple[np.ndarray, np.ndarray]], step: int) -> None:
+        """Predicted maps beside wanted ones."""
+        if self._writer is not None:
+            for name, pair in maps.items():
+                self._writer.add_image(f"maps/{name}", map_picture(*pair), step, dataformats="HWC")
+
+    def close(self) -> None:
+        """Writes what is left."""
+        if self._writer is not None:
+            self._writer.close()
+
+
+def map_picture(
+    predicted: Float[np.ndarray, "height width 3"], wanted: Float[np.ndarray, "height width 3"]
+) -> np.ndarray:
+    """Two offset maps and their difference side by side, as 8-bit RGB; grey is zero."""
+    scale = max(float(np.quantile(np.abs(wanted), 0.99)), 1e-6)
+    rows = np.concatenate([predicted, wanted, predicted - wanted], axis=1)
+    return np.clip(127.5 * (1.0 + rows / scale), 0, 255).astype(np.uint8)

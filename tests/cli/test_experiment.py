@@ -1,0 +1,82 @@
+"""From a configuration to a table of errors, through the command line, at toy size."""
+
+import json
+
+import pytest
+
+from physxnet_jax.cli import main
+from physxnet_jax.data import list_sequences, read_log
+
+DATASET = """
+from physxnet_jax.data import DatasetConfig
+from physxnet_jax.simulation import XPBD
+CONFIG = DatasetConfig(splits=("train",), templates=("bottom",), solver=XPBD(8, 1))
+"""
+TRAIN = """
+from physxnet_jax.models import Inputs, ModelConfig
+from physxnet_jax.training import TrainConfig
+CONFIG = TrainConfig(
+    model=ModelConfig(Inputs(), resolution=32, width=4, templates=("bottom",)),
+    epochs=2, batch=4, adversarial=False,
+)
+"""
+
+
+def test_build_train_evaluate(data_dir, tmp_path, capsys):
+    mocap = str(data_dir / "mocap")
+    for name, text in (("dataset.py", DATASET), ("tiny.py", TRAIN)):
+        (tmp_path / name).write_text(text)
+    root, run, out = (str(tmp_path / n) for n in ("set", "run", "errors.json"))
+    build = ["dataset", "build", str(tmp_path / "dataset.py"), "--out", root, "--mocap", mocap]
+    assert main([*build, "--only", "run", "--quiet"]) == 0
+    assert len(list_sequences(root)) == 1 and len(read_log(root)) == 1
+    found = str(tmp_path / "found.json")
+    sheet = tmp_path / "sheet.png"
+    check = ["dataset", "check", root, "--mocap", mocap, "--json", found, "--sheet", str(sheet)]
+    assert main(check) in (0, 1)
+    rows = json.loads((tmp_path / "found.json").read_text())["rows"]
+    assert {r["quantity"] for r in rows} >= {"frames missing", "largest offset, m"}
+    assert sheet.stat().st_size > 1000
+    train = ["train", str(tmp_path / "tiny.py"), "--data", root, "--out", run, "--steps", "2"]
+    assert main([*train, "--quiet"]) == 0
+    card = json.loads((tmp_path / "run/weights/card.json").read_text())
+    assert card["name"] == "tiny" and card["training"]["frames"] == 34
+    assert "CMU" in card["licence"]
+    # Errors on what was learned from: only that the way is whole is asked here.
+    measure = ["evaluate", "lbs", run, f"{run}+push", "--data", root, "--split", "train"]
+    measure += ["--templates", "bottom", "--out", out]
+    assert main(measure) == 0
+    rows = json.loads((tmp_path / "errors.json").read_text())
+    assert [r["method"] for r in rows] == ["lbs", run, f"{run}+push"]
+    assert all(r["finite_share"] == 1.0 and 0 < r["rmse_vertices_mm"] < 200 for r in rows)
+    assert (tmp_path / "errors_vertices.png").is_file()
+    assert "better than lbs" in (tmp_path / "errors.md").read_text()
+    before = (tmp_path / "errors.json").stat().st_mtime_ns
+    assert main([*measure, "--quiet"]) == 0
+    assert (tmp_path / "errors.json").stat().st_mtime_ns == before, "nothing is measured twice"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["dataset", "build", "nowhere.py", "--out", "x"], "no such configuration"),
+        (["dataset", "build", "nowhere.py"], "--out"),
+        (["dataset", "check", "nowhere"], "no actions"),
+        (["evaluate", "lbs", "--data", "nowhere"], "no 'test' actions"),
+        (["evaluate", "lbs", "--data", "nowhere", "--out", "x.csv"], ".json"),
+    ],
+)
+def test_what_is_missing_is_said_in_one_line(words, said, capsys):
+    assert main(words) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_a_configuration_that_is_none_is_refused(tmp_path, capsys):
+    path = tmp_path / "config.py"
+    for text, said in (("x = 1", "expected CONFIG"), ("1 / 0", "ZeroDivisionError")):
+        path.write_text(text)
+        assert main(["train", str(path), "--data", "x", "--out", str(tmp_path / "run")]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())
+    path.write_text(DATASET)
+    assert main(["dataset", "build", str(path), "--out", "x", "--shard", "2/2"]) == 2
+    assert "0 <= i < n" in capsys.readouterr().err

@@ -1,0 +1,143 @@
+"""Evaluation: what is known comes out, whatever the method."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.data import Sequence
+from physxnet_jax.evaluation import (
+    Answer,
+    check_sequence,
+    error_tables,
+    evaluate,
+    nearest_frame,
+    pose_features,
+    pose_network,
+    skinning,
+    training_frames,
+)
+from physxnet_jax.garment import template
+from physxnet_jax.motion import load_motion, make_motion
+
+META = {"engine": "test", "finite": True, "worst": {"penetration_max": 0.0}}
+BOTTOM = template("bottom").num_vertices
+
+
+def sequence(name="walk", frames=24, offset=(0.0, 0.0, 0.0), meta=META):
+    motion = load_motion("walk", fps=30.0)
+    motion = dataclasses.replace(
+        motion, rotations=motion.rotations[:frames], root=motion.root[:frames]
+    )
+    offsets = np.tile(np.float32(offset), (frames, BOTTOM, 1))
+    return Sequence(name, "test", motion, {"bottom": offsets}, {"bottom": meta})
+
+
+def measure(methods, sequences, done=()):
+    return list(evaluate(methods, sequences, templates=("bottom",), done=done))
+
+
+def test_skinning_is_off_by_the_offset_and_no_more():
+    rows = measure({"lbs": skinning()}, [sequence(), sequence("shifted", offset=(0.0, 0.01, 0.0))])
+    assert [r.action for r in rows] == ["walk", "shifted"]
+    assert rows[0].rmse_vertices_mm < 1e-3 and rows[0].wrinkle_deg < 0.05
+    assert rows[1].rmse_vertices_mm == pytest.approx(10.0, rel=1e-3)
+    assert rows[1].mse_vertices_mm2 == pytest.approx(100.0, rel=2e-3)
+    assert rows[1].rmse_texels_mm == pytest.approx(10.0, rel=1e-3)
+    assert rows[1].p95_mm == pytest.approx(10.0, rel=1e-3)
+    # A constant offset leaves folds, acceleration and jerk as they are.
+    assert rows[1].acceleration_error < 1e-2 and rows[1].wrinkle_deg < 0.05
+    assert rows[1].jitter == pytest.approx(rows[1].jitter_reference, rel=1e-3)
+    assert rows[0].ms_per_frame > 0 and rows[0].finite_share == 1.0
+    table = error_tables(rows)
+    assert "| shifted | 10.0 |" in table and "Reference: test" in table
+
+
+def test_rows_that_are_there_are_not_measured_again():
+    asked = []
+
+    def method(motion, name):
+        asked.append(motion.num_frames)
+        return skinning()(motion, name)
+
+    first = measure({"mine": method}, [sequence()])
+    assert len(asked) == 1
+    assert measure({"mine": method}, [sequence()], done=first) == []
+    again = measure({"mine": method}, [sequence(), sequence("b", frames=20)], done=first)
+    assert [r.action for r in again] == ["b"] and asked == [24, 20]
+
+
+def test_frames_that_are_not_finite_are_counted_and_left_out():
+    def broken(motion, name):
+        x = skinning()(motion, name).positions.copy()
+        x[5] = np.nan
+        return Answer(x, 1.0)
+
+    (row,) = measure({"broken": broken}, [sequence()])
+    assert row.finite_share == pytest.approx(23 / 24)
+    assert row.rmse_vertices_mm < 1e-3
+    lost = measure(
+        {"nothing": lambda m, n: Answer(broken(m, n).positions * np.nan, 1.0)}, [sequence()]
+    )
+    assert lost[0].finite_share == 0.0 and np.isnan(lost[0].rmse_vertices_mm)
+
+
+def test_cloth_that_came_off_is_no_reference():
+    off = {**META, "worst": {"penetration_max": 0.2}}
+    assert measure({"lbs": skinning()}, [sequence(meta=off)]) == []
+
+
+def bent(seed=0, frames=40):
+    """Offsets that the pose alone decides."""
+    s = sequence(frames=frames)
+    body_turn = np.asarray(s.motion.rotations)[:, 3:6, 1:].sum(axis=(1, 2))
+    offsets = np.zeros((frames, BOTTOM, 3), np.float32)
+    offsets[:, :, 1] = 0.02 * ((body_turn - body_turn.mean()) / body_turn.std())[:, None]
+    return dataclasses.replace(s, offsets={"bottom": offsets})
+
+
+def test_the_nearest_frame_of_the_training_set_is_the_frame_itself():
+    known = bent()
+    frames = training_frames([known], ("bottom",))
+    (row,) = measure({"nearest": nearest_frame(frames)}, [known])
+    assert row.rmse_vertices_mm < 0.2, "quantised twice"
+    assert np.abs(known.offsets["bottom"]).max() > 0.02
+
+
+def test_the_pose_network_learns_what_the_pose_decides():
+    known = bent()
+    frames = training_frames([known], ("bottom",))
+    rows = measure({"mlp": pose_network(frames, steps=300), "lbs": skinning()}, [known])
+    assert rows[0].rmse_vertices_mm < 0.3 * rows[1].rmse_vertices_mm
+
+
+def test_pose_features_do_not_see_where_the_person_stands_or_faces(body, rest):
+    from scipy.spatial.transform import Rotation
+
+    from physxnet_jax.motion import clip_transforms
+
+    m = load_motion("punch", fps=30.0)
+    turn = Rotation.from_euler("Y", 2.0)
+    q = np.asarray(m.rotations).copy()
+    q[:, 0] = (turn * Rotation.from_quat(q[:, 0], scalar_first=True)).as_quat(scalar_first=True)
+    other = make_motion(q, np.asarray(m.root) + 3.0, 30.0)
+    a, b = (
+        np.asarray(pose_features(jnp.asarray(clip_transforms(body, rest, x)[0]), body.parents))
+        for x in (m, other)
+    )
+    np.testing.assert_allclose(a, b, atol=1e-5)
+    assert np.abs(a[0] - a[20]).max() > 0.05
+
+
+def test_a_check_finds_explosions_wrong_counts_and_stretched_cloth():
+    fine = check_sequence(sequence(), 24)
+    assert all(f.holds for f in fine if "inside" not in f.quantity), "skinning is calm cloth"
+    far = sequence(offset=(0.0, 0.9, 0.0))
+    wrong = {f.quantity for f in check_sequence(far, 25) if not f.holds}
+    assert {"frames missing", "largest offset, m"} <= wrong
+    torn = sequence()
+    torn.offsets["bottom"][:, ::2] += 0.05
+    torn.offsets["bottom"][::2, 1::2] -= 0.05
+    wrong = {f.quantity for f in check_sequence(torn) if not f.holds}
+    assert {"strain, 99 %", "jerk over that of skinning"} <= wrong

@@ -1,0 +1,60 @@
+"""Metrics of folds and motion, in closed form."""
+
+import numpy as np
+import pytest
+
+from physxnet_jax.evaluation import (
+    acceleration_error,
+    area_strain,
+    dihedral_angles,
+    jitter,
+    wrinkle_error,
+)
+from physxnet_jax.garment import square_sheet
+
+# Two triangles that share the edge from (0, 0) to (0, 1).
+FACES = np.array([[0, 1, 2], [1, 0, 3]])
+
+
+def folded(angle):
+    return np.array(
+        [[0, 0, 0], [0, 1, 0], [-1, 0.5, 0], [np.cos(angle), 0.5, np.sin(angle)]], np.float32
+    )
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, -0.4, 1.5, -3.0])
+def test_the_angle_of_a_fold(angle):
+    seen = dihedral_angles(FACES, folded(angle)[None])
+    assert abs(seen[0, 0]) == pytest.approx(abs(angle), abs=1e-6)
+    assert np.sign(seen[0, 0]) == np.sign(angle) * np.sign(dihedral_angles(FACES, folded(1)[None]))
+
+
+def test_wrinkles_do_not_care_where_the_cloth_is():
+    x = np.stack([folded(a) for a in (0.1, 0.5, 1.0)])
+    assert wrinkle_error(FACES, x + 5.0, x) < 1e-3
+    assert wrinkle_error(FACES, np.stack([folded(0.0)] * 3), np.stack([folded(0.5)] * 3)) == (
+        pytest.approx(np.degrees(0.5), rel=1e-4)
+    )
+    # Past a half turn the short way counts.
+    gap = wrinkle_error(FACES, folded(3.1)[None], folded(-3.1)[None])
+    assert gap == pytest.approx(np.degrees(2 * np.pi - 6.2), rel=1e-3)
+
+
+def test_area_strain_of_a_stretched_sheet():
+    sheet = square_sheet(4)
+    x, faces = np.asarray(sheet.mesh.vertices), np.asarray(sheet.mesh.faces)
+    out = area_strain(x, faces, np.stack([x, x * np.float32(1.1)]))
+    np.testing.assert_allclose(out[0], 0.0, atol=1e-6)
+    np.testing.assert_allclose(out[1], 0.21, atol=1e-5)
+
+
+def test_jerk_and_acceleration_of_polynomials():
+    t = np.arange(12) / 30.0
+    x = np.zeros((12, 2, 3))
+    x[:, 0, 1] = t**3
+    assert jitter(x, 30.0) == pytest.approx(0.5 * 6.0, rel=1e-6), "one of two moves"
+    y = np.zeros_like(x)
+    y[:, :, 2] = (t**2)[:, None]
+    assert acceleration_error(y, np.zeros_like(y), 30.0) == pytest.approx(2.0, rel=1e-6)
+    assert jitter(y, 30.0) < 1e-6
+    assert jitter(x[:3], 30.0) == 0.0 and acceleration_error(x[:2], x[:2], 30.0) == 0.0
