@@ -1,11 +1,13 @@
 """The paper's experiment: every number and figure of docs/reproduction.md.
 
 Command: python experiments/reproduce.py --data runs/ours (and --data runs/blender, if built)
-Cost:    about 15 minutes on two cores for one engine; goes on where it was stopped.
-Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png, and the
-         tables between the marks of docs/reproduction.md and README.md. Datasets are built
-         by `physxnet dataset build experiments/configs/dataset_physxnet.py --out runs/ours`,
-         the weights `local` and `paper` by experiments/configs.
+Cost:    about 30 minutes on two cores for one engine (penetration takes most of it); goes
+         on where it was stopped.
+Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png, the
+         tables between the marks of docs/reproduction.md and README.md, and the measured
+         table in the cards of the packaged weights. Datasets are built by `physxnet dataset
+         build experiments/configs/dataset_physxnet.py --out runs/ours`, the weights `local`
+         and `paper` by experiments/configs.
 """
 
 import argparse
@@ -15,7 +17,7 @@ import re
 import statistics
 
 from physxnet_jax.cli import main as physxnet
-from physxnet_jax.evaluation import ActionError, error_tables, summary_table
+from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
 from physxnet_jax.files import whole_file
 from physxnet_jax.garment import TEMPLATES
 
@@ -47,6 +49,29 @@ def main() -> None:
             text = mark.sub(lambda m, b=block: f"{m[1]}{b.strip()}\n{m[2]}", text)
         with whole_file(path) as part:
             part.write_text(text)
+    for name in NETWORKS:
+        note_measured(name, rows)
+
+
+def note_measured(name: str, rows: list[ActionError]) -> None:
+    """Writes the means of packaged weights into their card."""
+    path = ROOT / "src/physxnet_jax/io/weights" / name / "card.json"
+    if not path.is_file():
+        return
+    card = json.loads(path.read_text())
+    card["measured"] = [
+        {
+            "reference": engine,
+            "template": t,
+            "rmse_vertices_mm": round(found["rmse_vertices_mm"], 2),
+            "rmse_vertices_mm_lbs": round(plain["rmse_vertices_mm"], 2),
+        }
+        for engine in dict.fromkeys(r.engine for r in rows)
+        for t in TEMPLATES
+        if (found := means(rows, name, t, engine)) and (plain := means(rows, "lbs", t, engine))
+    ]
+    with whole_file(path) as part:
+        part.write_text(json.dumps(card, indent=1))
 
 
 def claims(rows: list[ActionError]) -> str:

@@ -2,11 +2,10 @@
 
 Command: physxnet train experiments/configs/local_cpu.py --name local
          --data runs/ours --data runs/mirror --out runs/local
-Cost:    about 40 minutes on two cores.
+Cost:    about 45 minutes on two cores.
 Result:  the rows `local` of experiments/results/test_errors.md.
 
-Maps of 64 x 64 hold all but 3 mm of tops and bottoms. L1 alone: the adversarial loss
-doubles the cost of a step and doesn't lower the error (docs/reproduction.md).
+L1 alone: an adversarial loss costs a second network and isn't aimed at the error.
 """
 
 from physxnet_jax.models import Inputs, ModelConfig

@@ -2,12 +2,12 @@
 
 Command: physxnet train experiments/configs/paper_cpu.py --name paper --data runs/ours
          --out runs/paper
-Cost:    about 8 minutes on two cores.
+Cost:    about 6 minutes on two cores.
 Result:  the rows `paper` of experiments/results/test_errors.md.
 
 World frame, 18 channels, batch norm, adversarial and L1 loss, soft and flipped labels, as
 in the paper. Smaller are the maps (64 x 64 for 256 x 256), the width and the number of
-epochs (8 for 150): paper_cuda.py has them in full.
+epochs (5 for 150): paper_cuda.py has them in full.
 """
 
 from physxnet_jax.models import PAPER, ModelConfig
@@ -15,7 +15,7 @@ from physxnet_jax.training import TrainConfig
 
 CONFIG = TrainConfig(
     model=ModelConfig(PAPER, resolution=64, width=16),
-    epochs=8,
+    epochs=5,
     batch=8,
     learning_rate=1e-3,
     schedule="cosine",

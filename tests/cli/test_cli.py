@@ -61,7 +61,7 @@ def test_dress_writes_and_reports(tmp_path, capsys, method):
         (["dress", "walk", "--preview", "a.avi"], "preview"),
         (["dress", "walk", "--shape", "tall=1"], "height_up"),
         (["dress", "walk", "--shape", "gender=nan"], "from 0 to 1"),
-        (["dress", "walk", "--weights", "none"], "first"),
+        (["dress", "walk", "--weights", "none"], "local"),
         (["dress", "walk", "--frames", "0"], "at least one"),
     ],
 )

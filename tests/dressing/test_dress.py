@@ -1,11 +1,15 @@
 """Dressing: methods agree where they must, and nothing inside the body is left."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from physxnet_jax.dressing import dress
+from physxnet_jax.dressing import dress, pushed_network
 from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.evaluation import network
 from physxnet_jax.garment import template
+from physxnet_jax.io import load_predictor
 from physxnet_jax.motion import animate, load_motion
 
 
@@ -50,8 +54,6 @@ def test_trousers_go_beneath_a_top_and_stay_as_they_are_without_one():
 
 
 def test_two_garments_of_one_name_and_one_called_body_stay_apart(tmp_path):
-    import dataclasses
-
     named = dataclasses.replace(template("bottom"), name="body")
     clip = dress("walk", [named, "bottom", "bottom"], method="lbs", frames=2)
     assert [m.name for m in clip.meshes] == ["body", "body_2", "bottom", "bottom_2"]
@@ -62,3 +64,14 @@ def test_nonsense_is_refused():
         dress("walk", [], method="lbs", frames=2)
     with pytest.raises(PhysXNetError, match="at least one"):
         dress("walk", method="lbs", frames=0)
+
+
+@pytest.mark.parametrize("push", [False, True])
+def test_what_evaluation_measures_is_what_dress_gives(push):
+    predictor = load_predictor()
+    method = pushed_network(predictor) if push else network(predictor)
+    motion = load_motion("punch", fps=30.0)
+    short = dataclasses.replace(motion, rotations=motion.rotations[:20], root=motion.root[:20])
+    clip = dress(short, ["top"], include_body=False, resolve=push)
+    measured = method(short, "top").positions
+    np.testing.assert_allclose(measured, clip.garments[0].positions, atol=2e-5)

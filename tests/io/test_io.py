@@ -183,9 +183,9 @@ def test_meshes_that_are_nowhere_near_a_body_are_refused(tmp_path):
 
 
 def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
-    assert "first" in list_weights()
-    predictor = load_predictor("first")
-    assert read_card("first")["model"]["inputs"]["family"] == "local"
+    assert list_weights() == ["local", "paper"]
+    predictor = load_predictor("local")
+    assert read_card("local")["model"]["inputs"]["family"] == "local"
     save_predictor(tmp_path / "w", predictor, name="copy")
     again = load_predictor(tmp_path / "w")
     import jax
@@ -207,5 +207,5 @@ def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
     (tmp_path / "w/card.json").write_text("{")
     with pytest.raises(WeightsError, match="damaged"):
         load_predictor(tmp_path / "w")
-    with pytest.raises(WeightsError, match="first"):
+    with pytest.raises(WeightsError, match="local"):
         load_predictor("second")

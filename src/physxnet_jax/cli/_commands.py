@@ -35,7 +35,7 @@ class Dress:
     """True rate of the motion file, where its header is wrong or silent."""
     skeleton: pathlib.Path | None = None
     """The ASF of an AMC file, if it doesn't lie beside it."""
-    weights: str = "first"
+    weights: str = "local"
     """Name or folder of network weights."""
     shape: tuple[str, ...] = ()
     """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""

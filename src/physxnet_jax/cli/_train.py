@@ -37,7 +37,9 @@ def train(command: Train, console: Console) -> int:
     card = {
         **CARD,
         "data": [
-            {k: n[k] for k in ("engine", "splits", "fps", "quantum") if k in n} for n in notes
+            {k: n[k] for k in ("engine", "mirror", "speed", "fps", "quantum") if k in n}
+            | {"splits": list(command.splits)}
+            for n in notes
         ],
         "training": {
             "actions": len(sequences),

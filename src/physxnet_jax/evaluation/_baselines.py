@@ -90,7 +90,7 @@ def _nearest(worn: Any, r: Array, t: Array, fps: float) -> Array:
 def pose_network(
     frames: Frames,
     *,
-    steps: int = 4000,
+    steps: int = 2000,
     seed: int = 0,
     report: Callable[[str, int, int], None] | None = None,
 ) -> Blockwise:

@@ -26,7 +26,7 @@ from ..models import (
 )
 from ..uv import make_atlas
 
-DEFAULT = "first"
+DEFAULT = "local"
 _TENSORS, _CARD = "weights.safetensors", "card.json"
 
 
