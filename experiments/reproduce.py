@@ -1,7 +1,7 @@
 """The paper's experiment: every number and figure of docs/reproduction.md.
 
 Command: python experiments/reproduce.py --data runs/ours (and --data runs/blender, if built)
-Cost:    about 30 minutes on two cores for one engine (penetration takes most of it); goes
+Cost:    16 minutes on two cores for four methods (penetration takes most of it); goes
          on where it was stopped.
 Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png, the
          tables between the marks of docs/reproduction.md and README.md, and the measured

@@ -2,7 +2,7 @@
 
 Command: python experiments/unseen.py
          --data FOLDER (default: $PHYSXNET_DATA or ../shared), --weights local
-Cost:    about 10 minutes on two cores; goes on where it was stopped.
+Cost:    not run yet; goes on where it was stopped.
 Result:  experiments/results/unseen.json and .md: RMSE of network and skinning to a
          simulation of that very garment or shape, and the share of vertices inside.
 """

@@ -2,9 +2,8 @@
 
 Command: PHYSXNET_BLENDER=... physxnet dataset build experiments/configs/dataset_blender.py
          --out runs/blender --shard 0/2 (and 1/2 beside it)
-Cost:    about 1 second a frame and garment on one core: 5 hours of one core.
-Result:  cotton preset, quality 10 without self-collision, which is cleaner than quality
-         15 with it (docs/reproduction.md).
+Cost:    not built in full yet; estimated at 5 hours of one core.
+Result:  cotton preset, quality 10 without self-collision.
 """
 
 from physxnet_jax.data import DatasetConfig

@@ -1,7 +1,7 @@
 """The protocol's 34 actions through our own simulator.
 
 Command: physxnet dataset build experiments/configs/dataset_physxnet.py --out runs/ours
-Cost:    about 10 minutes on two cores (two shards side by side), 86 MB.
+Cost:    about 20 minutes of one core, 86 MB.
 Result:  the set that the shipped weights learned from; sizes and checksums are in
          docs/reproduction.md.
 """

@@ -1,7 +1,7 @@
-"""The 22 training actions at four fifths of their speed, mirrored, through our simulator.
+"""The 22 training actions at four fifths of their speed, through our simulator.
 
 Command: physxnet dataset build experiments/configs/dataset_slow.py --out runs/slow
-Cost:    about 10 minutes on two cores.
+Cost:    not built yet; estimated at 15 minutes of one core.
 Result:  the same poses with other velocities: what depends on which can be told apart.
 """
 

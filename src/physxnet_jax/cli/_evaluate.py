@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from rich.console import Console
 from rich.table import Table
@@ -43,8 +43,8 @@ def evaluate(command: Evaluate, console: Console) -> int:
         raise FormatError(f"{command.data}: no '{command.split}' actions; build a dataset first.")
     rows = _read(command.out)
     sequences = [read_sequence(f) for f in folders]
-    methods = {name: _method(name, command) for name in command.methods}
     with progress_bars(console) as progress:
+        methods = {name: _method(name, command, progress) for name in command.methods}
         for row in measure(
             methods,
             sequences,
@@ -101,7 +101,7 @@ def _rounded(row: ActionError) -> Mapping[str, object]:
     }
 
 
-def _method(name: str, command: Evaluate) -> Method:
+def _method(name: str, command: Evaluate, progress: Callable[[str, int, int], None]) -> Method:
     if name == "lbs":
         return skinning()
     if name in ACCURACY:
@@ -113,7 +113,7 @@ def _method(name: str, command: Evaluate) -> Method:
         known = training_frames(
             [read_sequence(f) for f in list_sequences(root, "train")], command.templates
         )
-        return nearest_frame(known) if name == "nearest" else pose_network(known)
+        return nearest_frame(known) if name == "nearest" else pose_network(known, report=progress)
     weights = name.removesuffix("+push")
     run = pathlib.Path(weights) / "weights"
     predictor = load_predictor(run if run.is_dir() else weights)

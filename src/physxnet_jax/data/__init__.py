@@ -10,6 +10,7 @@ from ._protocol import (
     read_protocol as read_protocol,
 )
 from ._store import (
+    QUANTUM as QUANTUM,
     Sequence as Sequence,
     dataset_digest as dataset_digest,
     list_sequences as list_sequences,

@@ -12,13 +12,12 @@ import optax
 from jaxtyping import Array, Float
 
 from ..body import Body, load_body
-from ..data import Sequence
+from ..data import QUANTUM, Sequence
 from ..garment import Template, template
 from ..models import Inputs
 from ..training import Frames, load_frames
 from ._methods import Blockwise, place_local, rest_and_skin
 
-_QUANTUM = 1e-4
 _HIDDEN = 512
 _BATCH = 64
 
@@ -83,7 +82,7 @@ def _nearest(worn: Any, r: Array, t: Array, fps: float) -> Array:
     rest, features, offsets = worn
     mine = pose_features(r, load_body().parents)
     gap = jnp.sum((mine[:, None] - features[None]) ** 2, axis=2)
-    found = offsets[jnp.argmin(gap, axis=1)].astype(jnp.float32) * _QUANTUM
+    found = offsets[jnp.argmin(gap, axis=1)].astype(jnp.float32) * QUANTUM
     return place_local(rest, r, t, found)
 
 
@@ -156,7 +155,7 @@ def _fit(
         pick = jax.random.randint(key, (_BATCH,), 0, len(features))
 
         def loss(p: Any) -> Array:
-            want = offsets[pick].astype(jnp.float32).reshape(_BATCH, -1) * _QUANTUM
+            want = offsets[pick].astype(jnp.float32).reshape(_BATCH, -1) * QUANTUM
             return jnp.mean(jnp.abs(_perceptron(p, features[pick]) - want))
 
         grads = jax.grad(loss)(params)

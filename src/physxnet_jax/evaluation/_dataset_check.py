@@ -5,7 +5,7 @@ from typing import SupportsFloat
 import numpy as np
 
 from ..data import Sequence
-from ..garment import Template, template
+from ..garment import TEMPLATES, Template, template
 from ..simulation import Scene, prepare_scene
 from ._methods import skinning
 from ._motion_metrics import jitter
@@ -36,7 +36,7 @@ def check_sequence(sequence: Sequence, frames: int | None = None) -> list[Findin
     def find(name: str, quantity: str, bound: float, measured: SupportsFloat) -> None:
         out.append(Finding(f"{sequence.name}, {name}", quantity, bound, float(measured)))
 
-    names: list[Template] = [t for t in ("top", "bottom", "dress") if t in sequence.offsets]
+    names: list[Template] = [t for t in TEMPLATES if t in sequence.offsets]
     for name in names:
         offsets = sequence.offsets[name]
         motion = sequence.motion

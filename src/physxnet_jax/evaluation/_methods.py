@@ -65,7 +65,6 @@ class Blockwise:
         body = load_body()
         rest = body.rest_vertices(body.default_shape())
         world, shift = clip_transforms(body, rest, motion)
-        # Padding and a block are one size: nothing is compiled twice.
         worn = self.wear(name)
         blocks, times = [], []
         # The first block is asked twice: compilation is no part of the time.

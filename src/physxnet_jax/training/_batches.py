@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ..body import Body
-from ..data import Sequence
+from ..data import QUANTUM, Sequence
 from ..errors import FormatError
 from ..garment import Garment
 from ..geometry import polar_rotation
@@ -26,8 +26,6 @@ from ..models import (
 from ..motion import clip_transforms
 from ..uv import Transference
 
-# Offsets are kept as whole tenths of a millimetre, as on disk.
-_QUANTUM = 1e-4
 # A cloth this deep in the body has come off: such a sequence teaches nothing.
 MAX_PENETRATION = 0.1
 _CHUNK = 16
@@ -100,7 +98,7 @@ def load_frames(
             offset = s.offsets[name]
             if inputs.family == "local":
                 offset = _to_local(g, world, offset)
-            targets[name].append(np.round(offset / _QUANTUM).astype(np.int16))
+            targets[name].append(np.round(offset / QUANTUM).astype(np.int16))
     cat = np.concatenate
     return Frames(
         cat(rotations),
@@ -171,7 +169,7 @@ def target_offsets(
     ``paper`` adds back the skinning and subtracts the skin at the texel (I_C of
     equation 9); ``local`` needs neither.
     """
-    offset = target.astype(jnp.float32) * _QUANTUM
+    offset = target.astype(jnp.float32) * QUANTUM
     if family == "local":
         return to_cloth @ offset
 
