@@ -120,6 +120,15 @@ def test_a_build_goes_on_where_it_was_and_is_another_with_another_solver(data_di
         build(DatasetConfig(templates=("bottom",), solver=XPBD(16, 1)))
 
 
+def test_unknown_actions_are_named_before_anything_is_built(data_dir, tmp_path):
+    config = DatasetConfig(templates=("bottom",))
+    with pytest.raises(
+        FormatError, match="no action 'fly' in the splits train, test; there are: w"
+    ):
+        build_dataset(config, tmp_path / "d", data_dir / "mocap", only=("run", "fly"))
+    assert not (tmp_path / "d").exists()
+
+
 def test_a_missing_protocol_is_named(tmp_path):
     with pytest.raises(MotionError, match=r"ACTIONS\.csv"):
         read_protocol(tmp_path)

@@ -54,4 +54,8 @@ def test_frames_can_be_chosen(standing):
         jnp.repeat(standing.rotations, 3, axis=0), jnp.repeat(standing.root, 3, axis=0), 30.0
     )
     x = np.repeat(assembly.rest[None].astype(np.float32), 3, axis=0)
-    assert penetration(assembly, motion, x, frames=np.asarray([0, 2])).depth.shape[0] == 2
+    chosen = penetration(assembly, motion, x, frames=np.asarray([0, 2]))
+    assert chosen.depth.shape[0] == 2 and np.isfinite(chosen.skin_outside).all()
+    some = penetration(assembly, motion, x, frames=np.asarray([0]), bare_skin=False)
+    np.testing.assert_array_equal(some.cloth_inside[0], chosen.cloth_inside[0])
+    assert np.isnan(some.skin_outside).all()

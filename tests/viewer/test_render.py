@@ -7,7 +7,7 @@ import pytest
 
 from physxnet_jax.dressing import dress
 from physxnet_jax.errors import FormatError
-from physxnet_jax.viewer import render_frame, render_preview
+from physxnet_jax.viewer import render_columns, render_frame, render_preview
 
 pytest.importorskip("pyvista")
 
@@ -33,6 +33,25 @@ def test_a_dressed_person_is_in_the_picture(tmp_path):
     assert np.asarray(iio.imread(tmp_path / "a.png")).std() > 5
 
 
+def test_columns_show_the_same_moment_under_their_titles(tmp_path):
+    import imageio.v3 as iio
+
+    long = dress("walk", ["bottom"], method="lbs", frames=2)
+    columns = {"one": long.meshes, "two": long.meshes[:1]}
+    path = render_columns(tmp_path / "a.png", columns, 30.0, size=(160, 192))
+    sheet = np.asarray(iio.imread(path)).astype(int)
+    assert sheet.shape[:2] == (2 * 192, 2 * 160), "a row for each column, two moments"
+    blue = (sheet[..., 2] - sheet[..., 0]) > 30
+    assert blue[:192].mean() > 5 * blue[192:].mean(), "trousers in the first row alone"
+    assert (sheet[:24, 40:120].sum(axis=2) < 300).any(), "no title"
+    short = dress("walk", ["bottom"], method="lbs", frames=1)
+    with pytest.raises(FormatError, match="alike"):
+        render_columns(tmp_path / "b.png", {"a": long.meshes, "b": short.meshes}, 30.0)
+    assert not (tmp_path / "b.png").exists()
+
+
 def test_other_extensions_are_refused(tmp_path):
     with pytest.raises(FormatError, match=r"\.mp4"):
         render_preview(tmp_path / "a.avi", [], 30.0)
+    with pytest.raises(FormatError, match="frames"):
+        render_columns(tmp_path / "a.png", {}, 30.0)

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..errors import FormatError
 from ..garment import template
 from ..motion import Motion, animate, at_speed, mirrored
 from ..simulation import PreparedScene, Scene, prepare_scene, simulate_batch
@@ -52,11 +53,17 @@ def build_dataset(
         Number of garments simulated now.
 
     Raises:
-        FormatError: Another dataset lies at ``root``.
+        FormatError: Another dataset lies at ``root``, or ``only`` names no action of it.
         MotionError: No protocol in ``folder``.
     """
     root = pathlib.Path(root)
     actions = [a for a in read_protocol(folder) if a.split in config.splits]
+    unknown = set(only) - {a.name for a in actions}
+    if unknown:
+        raise FormatError(
+            f"no action '{', '.join(sorted(unknown))}' in the splits {', '.join(config.splits)};"
+            f" there are: {', '.join(a.name for a in actions)}."
+        )
     actions = [a for a in actions if not only or a.name in only]
     open_dataset(root, _note(config))
     jobs = [(t, a) for t in config.templates for a in actions[shard[0] :: shard[1]]]

@@ -51,7 +51,7 @@ def check_sequence(sequence: Sequence, frames: int | None = None) -> list[Findin
         skinned = skinning()(motion, name).positions
         cloth = skinned + offsets
         looked = np.arange(0, len(cloth), _EVERY)
-        seen = penetration(scene.assembly, motion, cloth, frames=looked)
+        seen = penetration(scene.assembly, motion, cloth, frames=looked, bare_skin=False)
         find(name, "inside the body, share", _INSIDE, (seen.cloth_inside & ~seen.pinched).mean())
         strain = np.abs(edge_strain(scene.assembly, cloth))
         find(name, "strain, 99 %", _STRAIN, np.quantile(strain, 0.99))

@@ -164,7 +164,7 @@ class _Reference:
         gap = np.asarray(to_cloth @ jnp.asarray(x - y))[:, np.asarray(to_cloth.valid)]
         texels = float(np.mean(np.sum((1e3 * gap.astype(np.float64)) ** 2, axis=2)))
         looked = np.flatnonzero(finite)[::_EVERY]
-        inside = penetration(assembly, motion, shown, frames=looked)
+        inside = penetration(assembly, motion, shown, frames=looked, bare_skin=False)
         free = inside.cloth_inside & ~inside.pinched
         faces = np.asarray(assembly.faces)
         strain = np.abs(edge_strain(assembly, x))

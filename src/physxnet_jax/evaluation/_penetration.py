@@ -62,6 +62,7 @@ def penetration(
     positions: Float[np.ndarray, "frames vertices 3"],
     *,
     frames: Int[np.ndarray, " looked"] | None = None,
+    bare_skin: bool = True,
 ) -> Penetration:
     """Measures penetration without asking the simulator that made the cloth.
 
@@ -74,6 +75,8 @@ def penetration(
         motion: The body's motion.
         positions: Of all garments' vertices [m].
         frames: Which frames to look at; all by default.
+        bare_skin: Look for skin outside the cloth as well, a third of the time;
+            ``skin_outside`` is NaN otherwise.
     """
     looked = np.arange(len(positions)) if frames is None else np.asarray(frames)
     body = assembly.body
@@ -101,7 +104,7 @@ def penetration(
     edges = mesh_edges(assembly.faces)
     rim[edges.vertices[edges.count == 1]] = True
     outwards = _outwards(assembly, home)
-    clothed = _clothed(assembly, home, rim, outwards, cloth_around)
+    clothed = _clothed(assembly, home, rim, outwards, cloth_around) if bare_skin else None
     inside, depth, pinched, outside = [], [], [], []
     for k, x in zip(range(len(looked)), positions[looked]):
         s = skin[k]
@@ -135,6 +138,9 @@ def penetration(
             return crossed | (clear < _CLEAR * room)
 
         pinched.append(wrong & crowded(foot, up, assembly.thickness, at))
+        if clothed is None:
+            outside.append(np.nan)
+            continue
         under = _nearest(x, s)
         # Only cloth that is worn on that skin: a hand beside the hip is no hole in it.
         worn = np.linalg.norm(assembly.rest[under] - home, axis=1) < _UNDER

@@ -3,7 +3,7 @@
 import os
 import pathlib
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,10 +35,14 @@ def _plotter(size: tuple[int, int]) -> Any:
 class _Stage:
     """A scene whose meshes are moved from frame to frame."""
 
-    def __init__(self, meshes: Sequence[AnimatedMesh], size: tuple[int, int]) -> None:
+    def __init__(
+        self, meshes: Sequence[AnimatedMesh], size: tuple[int, int], title: str = ""
+    ) -> None:
         import pyvista
 
         self.plotter = _plotter(size)
+        if title:
+            self.plotter.add_text(title, position="upper_edge", font_size=12, color="#202428")
         self.meshes = meshes
         everything = np.concatenate([m.positions[0] for m in meshes])
         self.floor = float(min(m.positions[..., 1].min() for m in meshes))
@@ -116,23 +120,53 @@ def render_preview(
         FormatError: Another extension.
         MissingDependencyError: Without the ``render`` extra.
     """
+    return render_columns(path, {"": meshes}, fps, size=size, progress=progress)
+
+
+def render_columns(
+    path: str | pathlib.Path,
+    columns: Mapping[str, Sequence[AnimatedMesh]],
+    fps: float,
+    *,
+    size: tuple[int, int] = (480, 544),
+    progress: Callable[[str, int, int], None] | None = None,
+) -> pathlib.Path:
+    """Renders clips of the same motion side by side, from the same place.
+
+    Args:
+        path: ``.mp4``, ``.gif``, or ``.png`` (six moments, a row for each column's
+            title); written whole or not at all.
+        columns: What to show, by the title to show it under.
+        fps: Frames a second.
+        size: Width and height of one column; multiples of 16 for video.
+        progress: Called with a text, frames done and frames in all.
+
+    Raises:
+        FormatError: Another extension, or clips of different lengths.
+        MissingDependencyError: Without the ``render`` extra.
+    """
     path = check_preview(path)
+    lengths = {len(meshes[0].positions) for meshes in columns.values()}
+    if len(lengths) != 1:
+        raise FormatError(f"clips to compare have {sorted(lengths)} frames; they must be alike.")
     try:
         import imageio.v2 as imageio
     except ImportError as error:
         raise MissingDependencyError(
             "Videos need imageio: pip install 'physxnet-jax[render]'."
         ) from error
-    frames = len(meshes[0].positions)
-    stage = _Stage(meshes, size)
+    (frames,) = lengths
+    stages: list[_Stage] = []
     try:
+        for title, meshes in columns.items():
+            stages.append(_Stage(meshes, size, title))
         with whole_file(path) as part, warnings.catch_warnings():
             # ffmpeg is started by fork and exec: nothing of JAX runs in between.
             warnings.filterwarnings("ignore", message=".*os.fork.*")
             if path.suffix.lower() == ".png":
                 picks = np.unique(np.linspace(0, frames - 1, 6).astype(int))
-                shots = [stage.shoot(int(k)) for k in picks]
-                imageio.imwrite(part, np.concatenate(shots, axis=1))
+                rows = [np.concatenate([s.shoot(int(k)) for k in picks], axis=1) for s in stages]
+                imageio.imwrite(part, np.concatenate(rows, axis=0))
                 return path
             stride = 1 if path.suffix.lower() == ".mp4" else max(1, round(fps / 15))
             options: dict[str, Any] = (
@@ -142,11 +176,13 @@ def render_preview(
             )
             with imageio.get_writer(part, **options) as writer:
                 for k in range(0, frames, stride):
-                    writer.append_data(stage.shoot(k))  # pyright: ignore[reportAttributeAccessIssue]
+                    shot = np.concatenate([s.shoot(k) for s in stages], axis=1)
+                    writer.append_data(shot)  # pyright: ignore[reportAttributeAccessIssue]
                     if progress is not None:
                         progress("preview", k + 1, frames)
     finally:
-        stage.plotter.close()
+        for s in stages:
+            s.plotter.close()
     return path
 
 
