@@ -1,13 +1,12 @@
 """The paper's experiment: every number and figure of docs/reproduction.md.
 
 Command: python experiments/reproduce.py --data runs/ours (and --data runs/blender, if built)
-Cost:    16 minutes on two cores for four methods (penetration takes most of it); goes
-         on where it was stopped.
-Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png, the
-         tables between the marks of docs/reproduction.md and README.md, and the measured
-         table in the cards of the packaged weights. Datasets are built by `physxnet dataset
-         build experiments/configs/dataset_physxnet.py --out runs/ours`, the weights `local`
-         and `paper` by experiments/configs.
+Cost:    COST
+Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png;
+         datasets.json; the tables between the marks of docs/reproduction.md and README.md,
+         with those of ablations.py and unseen.py; and the measured table in the cards of
+         the packaged weights. Datasets are built by `physxnet dataset build`, weights
+         trained by `physxnet train`, both from experiments/configs.
 """
 
 import argparse
@@ -17,14 +16,36 @@ import re
 import statistics
 
 from physxnet_jax.cli import main as physxnet
+from physxnet_jax.data import dataset_digest, list_sequences, read_log, read_sequence
 from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
 from physxnet_jax.files import whole_file
 from physxnet_jax.garment import TEMPLATES
+from physxnet_jax.training import usable_garment
 
 ROOT = pathlib.Path(__file__).parents[1]
-OUT = ROOT / "experiments/results/test_errors.json"
-METHODS = ("lbs", "nearest", "mlp", "local", "local+push", "paper", "draft", "noise")
-NETWORKS = ("local", "paper")
+RESULTS = ROOT / "experiments/results"
+OUT = RESULTS / "test_errors.json"
+# A run that isn't shipped is named by its folder.
+METHODS = (
+    "lbs",
+    "nearest",
+    "mlp",
+    "runs/local-22",
+    "local",
+    "local+push",
+    "paper",
+    "draft",
+    "noise",
+)
+NETWORKS = ("local-22", "local", "paper")
+SETS = {
+    "ours": "protocol",
+    "mirror": "mirrored training actions",
+    "extra": "extra actions",
+    "extra_mirror": "mirrored extra actions",
+    "slow": "training actions at 0.8 of their speed",
+    "blender": "protocol, Blender",
+}
 SOFT = ("moon walk", "balancing", "walking")
 ABRUPT = ("strong gesture", "jump", "punch")
 
@@ -41,7 +62,13 @@ def main() -> None:
         if code:
             raise SystemExit(code)
     rows = [ActionError(**r) for r in json.loads(OUT.read_text())]
+    note_datasets(pathlib.Path(words.learn_from).parent)
     blocks = {"summary": summary_table(rows), "errors": error_tables(rows), "claims": claims(rows)}
+    blocks["datasets"] = dataset_table()
+    for name in ("ablations", "unseen"):
+        path = RESULTS / f"{name}.md"
+        if path.is_file():
+            blocks[name] = path.read_text()
     for path in (ROOT / "docs/reproduction.md", ROOT / "README.md"):
         text = path.read_text()
         for name, block in blocks.items():
@@ -51,6 +78,47 @@ def main() -> None:
             part.write_text(text)
     for name in NETWORKS:
         note_measured(name, rows)
+
+
+def note_datasets(folder: pathlib.Path) -> None:
+    """Sizes, times and checksums of the datasets that are built."""
+    path = RESULTS / "datasets.json"
+    known = json.loads(path.read_text()) if path.is_file() else {}
+    for name in SETS:
+        if not (folder / name / "dataset.json").is_file():
+            continue
+        stored = [
+            s for split in ("train", "test", "extra") for s in list_sequences(folder / name, split)
+        ]
+        sequences = [read_sequence(s) for s in stored]
+        digest, size = dataset_digest(folder / name)
+        log = read_log(folder / name)
+        known[name] = {
+            "actions": len(sequences),
+            "frames": sum(s.motion.num_frames for s in sequences),
+            "garments": sum(len(s.offsets) for s in sequences),
+            "came_off": sum(not usable_garment(s.meta[t]) for s in sequences for t in s.offsets),
+            "megabytes": round(size / 1e6, 1),
+            "seconds": round(sum(x["seconds"] for x in log)) if log else None,
+            "sha256": digest,
+        }
+    with whole_file(path) as part:
+        part.write_text(json.dumps(known, indent=1) + "\n")
+
+
+def dataset_table() -> str:
+    """A line for each dataset that was measured."""
+    known = json.loads((RESULTS / "datasets.json").read_text())
+    lines = [
+        "| set | actions | frames | garments simulated | came off | MB | built in, s | sha256 |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    lines += [
+        f"| {SETS[name]} | {d['actions']} | {d['frames']:,} | {d['garments']} | {d['came_off']} |"
+        f" {d['megabytes']} | {d['seconds'] or 'not logged'} | `{d['sha256'][:12]}` |"
+        for name, d in known.items()
+    ]
+    return "\n".join(lines)
 
 
 def note_measured(name: str, rows: list[ActionError]) -> None:

@@ -47,13 +47,16 @@ def test_build_train_evaluate(data_dir, tmp_path, capsys):
     measure += ["--templates", "bottom", "--out", out]
     assert main(measure) == 0
     rows = json.loads((tmp_path / "errors.json").read_text())
-    assert [r["method"] for r in rows] == ["lbs", run, f"{run}+push"]
+    assert [r["method"] for r in rows] == ["lbs", "run", "run+push"]
     assert all(r["finite_share"] == 1.0 and 0 < r["rmse_vertices_mm"] < 200 for r in rows)
     assert (tmp_path / "errors_vertices.png").is_file()
     assert "better than lbs" in (tmp_path / "errors.md").read_text()
     before = (tmp_path / "errors.json").stat().st_mtime_ns
     assert main([*measure, "--quiet"]) == 0
     assert (tmp_path / "errors.json").stat().st_mtime_ns == before, "nothing is measured twice"
+    capsys.readouterr()
+    assert main(["evaluate", run, "elsewhere/run", "--data", root, "--split", "train"]) != 0
+    assert "two methods are called run" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

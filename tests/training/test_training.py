@@ -10,6 +10,7 @@ import pytest
 
 from physxnet_jax.data import Sequence
 from physxnet_jax.errors import FormatError, PhysXNetError
+from physxnet_jax.evaluation import network, skinning
 from physxnet_jax.garment import template
 from physxnet_jax.models import PAPER, ModelConfig
 from physxnet_jax.motion import load_motion
@@ -129,6 +130,22 @@ def test_the_paper_family_trains_as_well(tmp_path):
     values = []
     train(config, [sequence()], tmp_path, steps=40, report=lambda a, b, m: values.append(m))
     assert values[-1]["l1"] < values[0]["l1"]
+
+
+def test_errors_at_vertices_are_learned_as_they_are_read(tmp_path):
+    model = dataclasses.replace(CONFIG.model, templates=("bottom",))
+    config = dataclasses.replace(CONFIG, model=model, adversarial=False, vertex_share=1.0)
+    data = sequence()
+    predictor = train(dataclasses.replace(config, epochs=20), [data], tmp_path, steps=80)
+    skinned = skinning()(data.motion, "bottom").positions
+    moved = network(predictor)(data.motion, "bottom").positions - skinned
+    wanted = data.offsets["bottom"]
+    left = np.linalg.norm(moved - wanted, axis=2).mean()
+    assert left < 0.6 * np.linalg.norm(wanted, axis=2).mean()
+    with pytest.raises(ValueError, match="0 to 1"):
+        dataclasses.replace(config, vertex_share=2.0)
+    with pytest.raises(ValueError, match="local family"):
+        dataclasses.replace(config, model=dataclasses.replace(model, inputs=PAPER))
 
 
 def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):

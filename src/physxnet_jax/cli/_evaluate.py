@@ -1,5 +1,6 @@
 """`physxnet evaluate`: errors of methods on every action, as rows, tables and charts."""
 
+import collections
 import dataclasses
 import json
 import pathlib
@@ -41,10 +42,13 @@ def evaluate(command: Evaluate, console: Console) -> int:
     folders = list_sequences(command.data, command.split)
     if not folders:
         raise FormatError(f"{command.data}: no '{command.split}' actions; build a dataset first.")
+    twice = [n for n, k in collections.Counter(map(_label, command.methods)).items() if k > 1]
+    if twice:
+        raise PhysXNetError(f"two methods are called {twice[0]}; rename a run's folder.")
     rows = _read(command.out)
     sequences = [read_sequence(f) for f in folders]
     with progress_bars(console) as progress:
-        methods = {name: _method(name, command, progress) for name in command.methods}
+        methods = {_label(name): _method(name, command, progress) for name in command.methods}
         for row in measure(
             methods,
             sequences,
@@ -99,6 +103,11 @@ def _rounded(row: ActionError) -> Mapping[str, object]:
         k: float(f"{v:.5g}") if isinstance(v, float) else v
         for k, v in dataclasses.asdict(row).items()
     }
+
+
+def _label(name: str) -> str:
+    """A run is called as its folder is, wherever that lies."""
+    return pathlib.Path(name).name
 
 
 def _method(name: str, command: Evaluate, progress: Callable[[str, int, int], None]) -> Method:

@@ -20,6 +20,9 @@ class TrainConfig:
         schedule: ``constant`` (the paper) or ``cosine`` (up over the first 2 % of the
             run, down to zero over the rest).
         l1_weight: lambda_L1 of equation 2.
+        vertex_share: Share of the L1 loss that is taken at the vertices of the templates,
+            where maps are read, instead of at texels: maps then learn to make up for
+            what reading them loses. 0 is the paper's; ``local`` only.
         adversarial: Whether there is a discriminator at all.
         discriminator_width: Channels of its first layer.
         seed: Of everything random.
@@ -40,6 +43,7 @@ class TrainConfig:
     momentum: float = 0.5
     schedule: Literal["constant", "cosine"] = "constant"
     l1_weight: float = 100.0
+    vertex_share: float = 0.0
     adversarial: bool = True
     discriminator_width: int = 16
     seed: int = 0
@@ -49,3 +53,9 @@ class TrainConfig:
     patience: int = 10
     checkpoint_every: int = 200
     max_skipped: int = 20
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.vertex_share <= 1.0:
+            raise ValueError(f"vertex_share is {self.vertex_share}; it is a share, 0 to 1.")
+        if self.vertex_share and self.model.family != "local":
+            raise ValueError("vertex_share needs the local family; the paper's loss has none.")

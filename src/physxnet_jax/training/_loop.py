@@ -15,8 +15,8 @@ from ..data import Sequence
 from ..errors import FormatError, PhysXNetError
 from ..files import whole_file
 from ..garment import template
-from ..models import ModelConfig, Normalisation, Predictor, Surface, make_surface
-from ..uv import Atlas, garment_map_rows, make_atlas
+from ..models import ModelConfig, Normalisation, Predictor, Surface, make_surface, make_wearable
+from ..uv import Atlas, bind, garment_map_rows, make_atlas
 from ._batches import (
     Frames,
     batch_indices,
@@ -42,12 +42,13 @@ def prepare_surface(model: ModelConfig) -> tuple[Atlas, Surface, dict[str, Cloth
     tables = {
         t: ClothTables(
             rows[t],
-            garments[t].rest_vertices(rest),
-            garments[t].skin,
+            g.rest_vertices(rest),
+            g.skin,
             surface.rest_dress if t == "dress" else surface.rest,
             surface.weights,
+            make_wearable(body, rest, g, bind(atlas, body, rest, g, rows[t].valid)),
         )
-        for t in model.templates
+        for t, g in garments.items()
     }
     return atlas, surface, tables
 

@@ -11,10 +11,12 @@ import optax
 from flax import nnx
 from jaxtyping import Array, Key
 
+from ..data import QUANTUM
 from ..models import (
     Discriminator,
     Normalisation,
     Surface,
+    Wearable,
     clip_features,
     make_generator,
     normalise,
@@ -63,6 +65,7 @@ class ClothTables:
         skin: Their skinning weights.
         anchor: Texel points at rest that the offsets start from [m].
         anchor_weights: Their skinning weights.
+        wearable: The template as it is dressed.
     """
 
     to_cloth: Transference
@@ -70,6 +73,7 @@ class ClothTables:
     skin: Array
     anchor: Array
     anchor_weights: Array
+    wearable: Wearable
 
 
 def make_optimiser(config: TrainConfig, rate: float, steps: int) -> optax.GradientTransformation:
@@ -193,6 +197,14 @@ def make_step(
             masks[t] = atlas.to_map(seen * weight)
         return x, targets, masks
 
+    def vertex_l1(texels: Array, target: Array, name: str, weight: Array, scale: Array) -> Array:
+        """Mean absolute error of offsets as `dress_frames` reads them, over their scale."""
+        wearable = tables[name].wearable
+        seen = jnp.where(surface.valid[name][None, :, None], texels, 0.0)
+        wanted = target.astype(jnp.float32) * QUANTUM / scale
+        everywhere = jnp.ones((wanted.shape[1],), bool)
+        return masked_l1(wearable.sample(seen), wanted, everywhere, weight)
+
     @jax.jit
     def look(
         state: TrainState, batch: Batch
@@ -220,10 +232,15 @@ def make_step(
             l1 = jnp.zeros(())
             parts = {}
             for t in templates:
-                parts[t] = masked_l1(
-                    atlas.from_map(maps[t]), targets[t], surface.valid[t], batch[f"weight_{t}"]
-                )
-                l1 = l1 + parts[t] / len(templates)
+                texels, weight = atlas.from_map(maps[t]), batch[f"weight_{t}"]
+                parts[t] = masked_l1(texels, targets[t], surface.valid[t], weight)
+                value = parts[t]
+                if config.vertex_share:
+                    read = vertex_l1(
+                        texels, batch[f"target_{t}"], t, weight, normalisation.offset[t]
+                    )
+                    value = (1.0 - config.vertex_share) * value + config.vertex_share * read
+                l1 = l1 + value / len(templates)
             fake = stack(maps, masks)
             adv = jnp.zeros(())
             if config.adversarial:
