@@ -54,6 +54,10 @@ def test_build_train_evaluate(data_dir, tmp_path, capsys):
     before = (tmp_path / "errors.json").stat().st_mtime_ns
     assert main([*measure, "--quiet"]) == 0
     assert (tmp_path / "errors.json").stat().st_mtime_ns == before, "nothing is measured twice"
+    assert main([*measure, "--times", "--quiet"]) == 0
+    again = json.loads((tmp_path / "errors.json").read_text())
+    assert [r.pop("ms_per_frame") > 0 for r in again] == [True] * len(rows)
+    assert again == [{k: v for k, v in r.items() if k != "ms_per_frame"} for r in rows]
     capsys.readouterr()
     assert main(["evaluate", run, "elsewhere/run", "--data", root, "--split", "train"]) != 0
     assert "two methods are called run" in capsys.readouterr().err

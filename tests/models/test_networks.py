@@ -18,12 +18,15 @@ from physxnet_jax.models import (
     clip_features,
     depth_to_space,
     dress_frames,
+    fold_batch_norm,
     make_generator,
     make_surface,
     make_wearable,
     pad_clip,
     pose_windows,
     skin_wearable,
+    start_stream,
+    stream_frame,
     upsampling_kernel,
 )
 from physxnet_jax.motion import clip_transforms, load_motion
@@ -294,3 +297,56 @@ def test_dressing_is_differentiable_in_the_pose(worn, body, rest, family):
     step = 2e-2
     difference = (height(jnp.float32(0.1 + step)) - height(jnp.float32(0.1 - step))) / (2 * step)
     assert float(slope) == pytest.approx(float(difference), rel=0.1, abs=2e-3)
+
+
+def trained_like(surface, atlas, inputs, seed=0):
+    """A predictor whose statistics and scales aren't those it starts with."""
+    config = ModelConfig(inputs, resolution=32, width=4, templates=("top", "dress"))
+    network = make_generator(config, seed=seed)
+    rng = np.random.default_rng(seed)
+    network.eval()
+    graph, state = nnx.split(network)
+
+    def spoil(path, x):
+        low = 0.3 if "var" in jax.tree_util.keystr(path) else -0.5
+        flat = x.ndim == 1
+        return jnp.asarray(rng.uniform(low, 1.5, x.shape), jnp.float32) if flat else x
+
+    state = jax.tree_util.tree_map_with_path(spoil, state)
+    one = jnp.ones((), jnp.float32)
+    scales = Normalisation(one, 10 * one, {"top": 0.1 * one, "dress": 0.1 * one})
+    return Predictor(atlas, surface, scales, state, graph, config)
+
+
+def test_folded_networks_answer_as_before(worn):
+    atlas, surface, _ = worn
+    predictor = trained_like(surface, atlas, LOCAL)
+    folded = fold_batch_norm(predictor)
+    x = jax.random.normal(jax.random.key(3), (3, surface.rest.shape[0], LOCAL.channels))
+    templates = ("top", "dress")
+    a, b = predictor.from_features(x, templates), folded.from_features(x, templates)
+    for t in templates:
+        assert float(jnp.abs(a[t]).max()) > 0.01
+        np.testing.assert_allclose(np.asarray(b[t]), np.asarray(a[t]), atol=2e-5)
+    names = [jax.tree_util.keystr(p) for p, _ in jax.tree_util.tree_leaves_with_path(folded.state)]
+    assert names and not any("mean" in n or "norm" in n for n in names)
+    again = fold_batch_norm(folded)
+    for one, two in zip(jax.tree.leaves(folded.state), jax.tree.leaves(again.state), strict=True):
+        np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
+
+
+@pytest.mark.parametrize("inputs", [LOCAL, PAPER_FAR], ids=["local", "far"])
+def test_a_stream_is_the_clip_frame_by_frame(worn, body, rest, inputs):
+    atlas, surface, wearables = worn
+    predictor = trained_like(surface, atlas, inputs)
+    world, shift = transforms(body, rest)
+    clip = dress_frames(
+        predictor, wearables, pad_clip(world, inputs), pad_clip(shift, inputs), 30.0
+    )
+    step = jax.jit(stream_frame, static_argnames="fps", donate_argnames="stream")
+    stream = start_stream(predictor, world[0], shift[0])
+    for k in range(world.shape[0]):
+        stream, garments = step(predictor, wearables, stream, world[k], shift[k], fps=30.0)
+        for live, whole in zip(garments, clip, strict=True):
+            np.testing.assert_allclose(np.asarray(live), np.asarray(whole[k]), atol=2e-5)
+    assert np.abs(np.asarray(clip[0][-1] - clip[0][0])).max() > 0.01, "nothing moves"

@@ -292,6 +292,8 @@ class Evaluate:
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Rows as JSON; tables (.md) and two charts (_vertices.png, _texels.png) beside it.
     Rows that are there already are kept."""
+    times: bool = False
+    """Measure the times of these methods' rows again, in one go, and nothing else."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False

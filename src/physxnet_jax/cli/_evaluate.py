@@ -23,6 +23,7 @@ from ..evaluation import (
     nearest_frame,
     network,
     pose_network,
+    retime,
     skinning,
     summary_table,
     training_frames,
@@ -49,16 +50,21 @@ def evaluate(command: Evaluate, console: Console) -> int:
     sequences = [read_sequence(f) for f in folders]
     with progress_bars(console) as progress:
         methods = {_label(name): _method(name, command, progress) for name in command.methods}
-        for row in measure(
-            methods,
-            sequences,
-            templates=command.templates,
-            done=rows,
-            report=lambda text, k, n: progress("rows", k, n),
-        ):
-            rows.append(row)
+
+        def show(_: str, k: int, n: int) -> None:
+            progress("rows", k, n)
+
+        if command.times:
+            rows = list(retime(methods, sequences, rows, report=show))
             if command.out is not None:
                 _write(command.out, rows)
+        else:
+            for row in measure(
+                methods, sequences, templates=command.templates, done=rows, report=show
+            ):
+                rows.append(row)
+                if command.out is not None:
+                    _write(command.out, rows)
     for engine in dict.fromkeys(r.engine for r in rows):
         console.print(_summary(rows, engine))
     if command.out is not None:

@@ -16,7 +16,12 @@ from ._bench import (
     time_to_error as time_to_error,
 )
 from ._dataset_check import check_sequence as check_sequence
-from ._evaluate import ActionError as ActionError, evaluate as evaluate, means as means
+from ._evaluate import (
+    ActionError as ActionError,
+    evaluate as evaluate,
+    means as means,
+    retime as retime,
+)
 from ._methods import (
     NOISE as NOISE,
     Answer as Answer,

@@ -120,6 +120,34 @@ def evaluate(
         yield rows.measure(label, methods[label], sequence, name)
 
 
+def retime(
+    methods: Mapping[str, Method],
+    sequences: Items[Sequence],
+    rows: Items[ActionError],
+    *,
+    report: Callable[[str, int, int], None] | None = None,
+) -> Iterator[ActionError]:
+    """Rows with their times measured again, one after another: ratios want one quiet hour.
+
+    Args:
+        methods: By name; rows of others are passed on as they are.
+        sequences: The actions of the rows.
+        rows: What was measured before.
+        report: Called with a text, rows done and rows in all.
+
+    Yields:
+        Every row, in order.
+    """
+    actions = {s.name: s for s in sequences}
+    for k, row in enumerate(rows):
+        if report is not None:
+            report(f"{row.method}, {row.action}, {row.template}", k, len(rows))
+        if row.method in methods and row.action in actions:
+            answer = methods[row.method](actions[row.action].motion, row.template)  # pyright: ignore[reportArgumentType]
+            row = dataclasses.replace(row, ms_per_frame=answer.ms_per_frame)
+        yield row
+
+
 class _Reference:
     """What is the same for every method."""
 

@@ -6,8 +6,10 @@ from ._features import (
     Family as Family,
     Inputs as Inputs,
     clip_features as clip_features,
+    point_features as point_features,
     skin_points as skin_points,
 )
+from ._fold import fold_batch_norm as fold_batch_norm
 from ._networks import Discriminator as Discriminator, Generator as Generator
 from ._predictor import (
     ModelConfig as ModelConfig,
@@ -24,4 +26,9 @@ from ._predictor import (
     pad_clip as pad_clip,
     pose_windows as pose_windows,
     skin_wearable as skin_wearable,
+)
+from ._stream import (
+    Stream as Stream,
+    start_stream as start_stream,
+    stream_frame as stream_frame,
 )

@@ -116,18 +116,35 @@ def clip_features(
     points, blends = jax.vmap(skin_points, in_axes=(None, None, 0, 0))(
         rest, weights, rotations, translations
     )
+    return point_features(points, blends[inputs.window - 1 :], fps, inputs)
+
+
+def point_features(
+    points: Float[Array, "padded texels 3"],
+    blends: Float[Array, "frames texels 3 3"],
+    fps: float,
+    inputs: Inputs,
+) -> Float[Array, "frames texels channels"]:
+    """`clip_features` of points that are skinned already.
+
+    Args:
+        points: Skinned texel points [m], ``inputs.window - 1`` frames more than wanted.
+        blends: Linear parts of the skinning of the frames wanted.
+        fps: Frames a second.
+        inputs: Which features.
+    """
     lead = inputs.window - 1
-    frames = rotations.shape[0] - lead
+    frames, texels = blends.shape[:2]
     back = [lead - inputs.stride * k for k in range(inputs.frames - 1, -1, -1)]
     moved = [velocity_maps(points, fps)]
     if inputs.acceleration:
         moved.append(acceleration_maps(points, fps))
     both = jnp.stack([x[k : k + frames] for x in moved for k in back], axis=2)
     if inputs.family == "paper":
-        return both.reshape(frames, rest.shape[0], -1)
-    frame = polar_rotation(blends[lead:])
+        return both.reshape(frames, texels, -1)
+    frame = polar_rotation(blends)
     turned = jnp.einsum("fpba,fpkb->fpka", frame, both, precision=_EXACT)
-    out = [turned.reshape(frames, rest.shape[0], -1)]
+    out = [turned.reshape(frames, texels, -1)]
     if inputs.gravity:
         out.append(-frame[:, :, 1, :])
     if inputs.place:

@@ -1,0 +1,103 @@
+"""Batch norm folded into the convolutions: the same answers with less to do."""
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import nnx
+from jaxtyping import Array, Float
+
+from ._blocks import Down, Up, depth_to_space, upsampling_kernel
+from ._networks import Generator
+from ._predictor import Predictor
+
+
+class _Convolution(nnx.Module):
+    """A convolution with a bias, and what follows it."""
+
+    def __init__(
+        self, kernel: Array, bias: Array, *, stride: int, slope: float | None, regroup: bool
+    ) -> None:
+        self.kernel, self.bias = nnx.Param(kernel), nnx.Param(bias)
+        self.stride, self.slope, self.regroup = stride, slope, regroup
+
+    def __call__(
+        self, x: Float[Array, "batch height width channels"]
+    ) -> Float[Array, "batch h w outputs"]:
+        """Features of half or twice the size."""
+        x = jax.lax.conv_general_dilated(
+            x,
+            self.kernel[...].astype(x.dtype),
+            (self.stride, self.stride),
+            ((1, 1), (1, 1)),
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        )
+        x = x + self.bias[...].astype(x.dtype)[None, None, None]
+        if self.regroup:
+            x = depth_to_space(x)
+        return x if self.slope is None else jnp.where(x > 0, x, self.slope * x)
+
+
+def fold_batch_norm(predictor: Predictor) -> Predictor:
+    """A predictor whose network has no batch norm left, with the same answers.
+
+    One that is folded already stays as it is.
+
+    The statistics are fixed outside training, so each norm is a scale and a shift of its
+    convolution's output. Kernels of upsampling are put into the form they are used in.
+    The result can be differentiated but isn't meant to be trained or saved.
+
+    Args:
+        predictor: A predictor with a `Generator`.
+
+    Returns:
+        The folded predictor; answers differ by rounding alone.
+    """
+    network = nnx.merge(predictor.graph, predictor.state, copy=True)
+    if not isinstance(network, Generator):
+        raise TypeError(f"a Generator is wanted, got {type(network).__name__}.")
+    parts: Any = network
+    for k, layer in enumerate(parts.encoder):
+        parts.encoder[k] = _down(layer) if isinstance(layer, Down) else layer
+    for decoder in parts.decoders.values():
+        for k, layer in enumerate(decoder.layers):
+            decoder.layers[k] = _up(layer) if isinstance(layer, Up) else layer
+    graph, state = nnx.split(parts)
+    return dataclasses.replace(predictor, graph=graph, state=state)
+
+
+def _down(layer: Down) -> _Convolution:
+    kernel = layer.conv.kernel[...]
+    bias = None if layer.conv.bias is None else layer.conv.bias[...]
+    scale, shift = _affine(layer.norm, kernel.shape[-1], bias)
+    return _Convolution(
+        kernel * scale[None, None, None], shift, stride=2, slope=layer.slope, regroup=False
+    )
+
+
+def _up(layer: Up) -> _Convolution:
+    kernel = layer.kernel[...]
+    bias = None if layer.bias is None else layer.bias[...]
+    scale, shift = _affine(layer.norm, kernel.shape[-1], bias)
+    return _Convolution(
+        upsampling_kernel(kernel * scale[None, None, None]),
+        jnp.tile(shift, 4),
+        stride=1,
+        slope=None,
+        regroup=True,
+    )
+
+
+def _affine(
+    norm: nnx.BatchNorm | None, channels: int, bias: Array | None
+) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
+    """Scale and shift that stand for a bias and the norm after it."""
+    before = jnp.zeros((channels,), jnp.float32) if bias is None else bias
+    if norm is None:
+        return jnp.ones((channels,), jnp.float32), before
+    scale = jax.lax.rsqrt(norm.var[...] + norm.epsilon)
+    if norm.scale is not None:
+        scale = scale * norm.scale[...]
+    shift = (before - norm.mean[...]) * scale
+    return scale, shift if norm.bias is None else shift + norm.bias[...]

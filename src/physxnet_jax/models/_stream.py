@@ -1,0 +1,84 @@
+"""Dressing live: a frame in, a frame out."""
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..typing import pytree
+from ._features import point_features, skin_points
+from ._predictor import Predictor, Wearable, normalise, place_sampled
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class Stream:
+    """What is remembered from frame to frame.
+
+    Attributes:
+        points: Skinned texel points of the last ``config.inputs.window - 1`` frames [m],
+            oldest first, shape [window - 1, texels, 3].
+    """
+
+    points: Float[Array, "lead texels 3"]
+
+
+def start_stream(
+    predictor: Predictor,
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+) -> Stream:
+    """A stream of a person who has stood in this pose until now.
+
+    Args:
+        predictor: The network.
+        rotations: World rotations of joints in the first frame.
+        translations: World translations of joints [m], likewise.
+    """
+    surface = predictor.surface
+    points, _ = skin_points(surface.rest, surface.weights, rotations, translations)
+    lead = predictor.config.inputs.window - 1
+    return Stream(jnp.broadcast_to(points, (lead, *points.shape)))
+
+
+def stream_frame(
+    predictor: Predictor,
+    wearables: Sequence[Wearable],
+    stream: Stream,
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+    fps: float,
+) -> tuple[Stream, tuple[Float[Array, "vertices 3"], ...]]:
+    """The next frame's garments [m]; pure, and the same as `dress_frames` of the clip.
+
+    Each pose is skinned once, whatever the window. Under `jax.jit` donate ``stream``.
+
+    Args:
+        predictor: The network.
+        wearables: What is worn.
+        stream: From `start_stream` or the frame before.
+        rotations: World rotations of joints in this frame.
+        translations: World translations of joints [m], likewise.
+        fps: Frames a second.
+
+    Returns:
+        The stream for the next frame, and positions of each garment.
+
+    Example:
+        >>> step = jax.jit(stream_frame, static_argnames="fps", donate_argnames="stream")
+    """
+    surface, inputs = predictor.surface, predictor.config.inputs
+    points, blend = skin_points(surface.rest, surface.weights, rotations, translations)
+    window = jnp.concatenate([stream.points, points[None]])
+    features = point_features(window, blend[None], fps, inputs)
+    features = normalise(features, predictor.normalisation, inputs)
+    templates = tuple(dict.fromkeys(w.template for w in wearables))
+    offsets = predictor.from_features(features, templates)
+    worn = tuple(
+        place_sampled(
+            w, rotations, translations, w.sample(offsets[w.template][0]), predictor.config.family
+        )
+        for w in wearables
+    )
+    return Stream(window[1:]), worn
