@@ -12,7 +12,7 @@ from physxnet_jax.evaluation import PEER_CASES, run_peer
 from physxnet_jax.garment import square_sheet
 from physxnet_jax.motion import animate, load_motion
 from physxnet_jax.simulation import Rollout, Scene, prepare_scene
-from physxnet_jax.simulation._outside import simulate_outside
+from physxnet_jax.simulation._outside import _deepest, simulate_outside
 from physxnet_jax.simulation.newton import find_newton
 
 COPY = """
@@ -64,6 +64,18 @@ def test_the_clip_comes_back_without_its_lead_in(tmp_path, scene, motion):
     total = seen[-1][1]
     assert seen[-1][0] == total and total > 5
     assert out.finite.all() and len(out.diagnostics["milliseconds"]) == 5
+
+
+def test_cloth_inside_is_found_by_its_depth():
+    import trimesh
+
+    ball = trimesh.creation.icosphere(subdivisions=4)
+    skin = np.asarray(ball.vertices, np.float32)[None].repeat(3, axis=0)
+    cloth = np.zeros((3, 2, 3), np.float32)
+    cloth[:, 0, 1] = (1.2, 0.7, np.nan)
+    cloth[:, 1, 0] = 1.1
+    found = _deepest(cloth, skin, np.asarray(ball.faces))
+    np.testing.assert_allclose(found, [0.0, 0.3, 0.0], atol=0.01)
 
 
 def test_its_last_words_are_given_when_it_fails(tmp_path, scene, motion):

@@ -12,7 +12,7 @@ from ..body import Body, load_body
 from ..errors import PhysXNetError
 from ..garment import Garment
 from ..io import DEFAULT, AnimatedMesh, load_garment, load_predictor
-from ..models import Predictor, Wearable, make_surface, make_wearable
+from ..models import Predictor, Wearable, fold_batch_norm, make_surface, make_wearable
 from ..motion import (
     Motion,
     clip_transforms,
@@ -137,7 +137,7 @@ def dress(
     predictor = None
     if method == "network":
         with watch("weights"):
-            predictor = load_predictor(weights)
+            predictor = fold_batch_norm(load_predictor(weights))
             predictor = fit_surface(predictor, body, rest, shape)
         with watch("binding"):
             wearables = [_bound(predictor, body, rest, g) for g in garments]

@@ -14,7 +14,14 @@ from jaxtyping import Array, Float
 from ..body import load_body
 from ..garment import Template, template
 from ..geometry import polar_rotation
-from ..models import Predictor, Wearable, dress_frames, make_wearable, skin_points
+from ..models import (
+    Predictor,
+    Wearable,
+    dress_frames,
+    fold_batch_norm,
+    make_wearable,
+    skin_points,
+)
 from ..motion import BLOCK, Motion, clip_transforms, padded_block
 from ..simulation import ACCURACY, PreparedScene, Scene, prepare_scene, simulate_batch
 from ..uv import bind
@@ -114,6 +121,7 @@ def network(predictor: Predictor) -> Blockwise:
     """A trained network, without push-out."""
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
+    predictor = fold_batch_norm(predictor)
 
     @functools.cache
     def wear(name: Template) -> Wearable:

@@ -8,10 +8,14 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, Int
+from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, triangulate
 from ..errors import SimulationError
+from ..geometry import vertex_normals
 from ..motion import Motion, animate
 from ._assembly import float32
 from ._diagnostics import Rollout
@@ -92,7 +96,25 @@ def simulate_outside(
         "speed_max": speed.max(axis=1),
         "worst_vertex": speed.argmax(axis=1),
         "residual_p99": np.zeros(len(positions)),
+        "penetration_max": _deepest(positions, arrays["skin"][skipped:], arrays["skin_faces"]),
         "milliseconds": taken[skipped:],
     }
     pieces = tuple(positions[:, i:j] for i, j in zip(assembly.parts, assembly.parts[1:]))
     return Rollout(pieces, motion.fps, diagnostics, motion.name)
+
+
+def _deepest(
+    cloth: Float[np.ndarray, "frames vertices 3"],
+    skin: Float[np.ndarray, "frames body 3"],
+    faces: Int[np.ndarray, "faces 3"],
+) -> Float[np.ndarray, " frames"]:
+    """Distance of the deepest vertex inside the body from the nearest skin vertex [m]."""
+    out = np.zeros(len(cloth))
+    for k, (x, s) in enumerate(zip(cloth, skin, strict=True)):
+        if not np.isfinite(x).all():
+            continue
+        normal = np.asarray(vertex_normals(jnp.asarray(s), jnp.asarray(faces)))
+        far, near = map(np.asarray, KDTree(s).query(x))
+        under = np.einsum("vi,vi->v", x - s[near], normal[near]) < 0
+        out[k] = np.max(far, where=under, initial=0.0)
+    return out
