@@ -9,6 +9,14 @@ from ._dress import (
     fit_surface as fit_surface,
     unbound_wearable as unbound_wearable,
 )
+from ._dresser import (
+    Dresser as Dresser,
+    clothe as clothe,
+    clothe_frame as clothe_frame,
+    make_dresser as make_dresser,
+    start_clothing as start_clothing,
+)
+from ._export import EXPORTED as EXPORTED, export_dresser as export_dresser
 from ._meshes import animated_meshes as animated_meshes
 from ._method import pushed_network as pushed_network
 from ._push_out import (

@@ -140,7 +140,7 @@ def dress(
             predictor = fold_batch_norm(load_predictor(weights))
             predictor = fit_surface(predictor, body, rest, shape)
         with watch("binding"):
-            wearables = [_bound(predictor, body, rest, g) for g in garments]
+            wearables = [bound_wearable(predictor, body, rest, g) for g in garments]
         for w in wearables:
             hits[w.name] = w.binding.hit_rate
             fallbacks[w.name] = w.binding.fallbacks
@@ -185,7 +185,14 @@ def fit_surface(
     return dataclasses.replace(predictor, surface=surface)
 
 
-def _bound(predictor: Predictor, body: Body, rest: Array, garment: Garment) -> Wearable:
+def bound_wearable(
+    predictor: Predictor, body: Body, rest: Float[Array, "all 3"], garment: Garment
+) -> Wearable:
+    """A garment bound to a predictor's atlas, on a body shape.
+
+    Raises:
+        PhysXNetError: The predictor has no decoder for the garment's template.
+    """
     if garment.template not in predictor.config.templates:
         raise PhysXNetError(
             f"{garment.name}: the weights have no decoder for '{garment.template}', only"

@@ -1,0 +1,174 @@
+"""Clothes as a layer: one pure function from joint rotations to clothed vertices."""
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from ..body import Body, load_body
+from ..garment import Garment
+from ..io import DEFAULT, load_garment, load_predictor
+from ..models import (
+    Predictor,
+    Stream,
+    Wearable,
+    dress_frames,
+    fold_batch_norm,
+    pad_clip,
+    start_stream,
+    stream_frame,
+)
+from ..typing import pytree
+from ._dress import bound_wearable, fit_surface
+from ._meshes import with_names
+from ._push_out import SkinPatch, make_patch, push_out, tuck_in
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class Dresser:
+    """A person's clothes, ready to be worn in any pose.
+
+    Attributes:
+        body: The body.
+        rest: Its vertices at rest [m].
+        predictor: The network, batch norm folded.
+        wearables: What is worn.
+        patches: The skin that each garment is pushed out of.
+        faces: Triangles of each garment, shape [faces, 3].
+        resolve: Whether it is.
+    """
+
+    body: Body
+    rest: Float[Array, "all 3"]
+    predictor: Predictor
+    wearables: tuple[Wearable, ...]
+    patches: tuple[SkinPatch, ...]
+    faces: tuple[Int[Array, "faces 3"], ...]
+    resolve: bool = dataclasses.field(metadata={"static": True})
+
+
+def make_dresser(
+    wear: Sequence[Garment | str | pathlib.Path] = ("top", "bottom"),
+    *,
+    weights: str | pathlib.Path | Predictor = DEFAULT,
+    body: Body | None = None,
+    shape: Float[Array, " shapes"] | None = None,
+    resolve: bool = True,
+) -> Dresser:
+    """Loads weights and binds garments, once for all poses.
+
+    Args:
+        wear: Garments, OBJ files or template names.
+        weights: Name or folder of network weights, or a predictor.
+        body: The body; the built-in one by default.
+        shape: Shape parameters; the default shape if omitted.
+        resolve: Push vertices that end inside the body onto it.
+
+    Raises:
+        PhysXNetError: Anything that can't be read or bound; the text says why.
+    """
+    body = load_body() if body is None else body
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    garments = with_names(
+        [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
+    )
+    predictor = weights if isinstance(weights, Predictor) else load_predictor(weights)
+    predictor = fold_batch_norm(fit_surface(predictor, body, rest, shape))
+    wearables = tuple(bound_wearable(predictor, body, rest, g) for g in garments)
+    patches = tuck_in(
+        [make_patch(body, rest, w, g.mesh) for w, g in zip(wearables, garments, strict=True)],
+        wearables,
+    )
+    faces = tuple(jnp.asarray(g.mesh.faces) for g in garments)
+    return Dresser(body, rest, predictor, wearables, patches, faces, resolve)
+
+
+def clothe(
+    dresser: Dresser,
+    rotations: Float[Array, "frames joints 4"],
+    root: Float[Array, "frames 3"],
+    fps: float,
+) -> dict[str, Float[Array, "frames vertices 3"]]:
+    """Clothes in successive frames; pure, for `jax.jit`, `jax.vmap` and `jax.grad`.
+
+    Before the first frame the person is taken to have stood still.
+
+    Args:
+        dresser: From `make_dresser`.
+        rotations: Joint rotations relative to their parents, unit quaternions wxyz, as in
+            `Motion`.
+        root: Position of the root joint [m].
+        fps: Frames a second; static under `jax.jit`.
+
+    Returns:
+        Vertices [m] by garment's name.
+
+    Example:
+        >>> import jax
+        >>> motion = load_motion("walk", fps=30)
+        >>> cloth = jax.jit(clothe, static_argnames="fps")(
+        ...     make_dresser(["bottom"]), motion.rotations[:2], motion.root[:2], fps=30.0
+        ... )
+        >>> cloth["bottom"].shape
+        (2, 2726, 3)
+    """
+    world, shift = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(
+        rotations, root
+    )
+    inputs = dresser.predictor.config.inputs
+    raw = dress_frames(
+        dresser.predictor, dresser.wearables, pad_clip(world, inputs), pad_clip(shift, inputs), fps
+    )
+    out = {}
+    for w, x, patch in zip(dresser.wearables, raw, dresser.patches, strict=True):
+        if dresser.resolve:
+            x = jax.vmap(lambda p, r, t, q=patch: push_out(q, p, r, t))(x, world, shift)
+        out[w.name] = x
+    return out
+
+
+def start_clothing(
+    dresser: Dresser, rotations: Float[Array, "joints 4"], root: Float[Array, "3"]
+) -> Stream:
+    """The state from which `clothe_frame` goes on: a person who stood still until now.
+
+    Args:
+        dresser: From `make_dresser`.
+        rotations: Joint rotations of the first frame.
+        root: Position of the root joint [m].
+    """
+    world, shift = dresser.body.transforms(dresser.rest, rotations, root)
+    return start_stream(dresser.predictor, world, shift)
+
+
+def clothe_frame(
+    dresser: Dresser,
+    stream: Stream,
+    rotations: Float[Array, "joints 4"],
+    root: Float[Array, "3"],
+    fps: float,
+) -> tuple[Stream, dict[str, Float[Array, "vertices 3"]]]:
+    """The next frame's clothes, for live use; the same as `clothe` of the whole clip.
+
+    Under `jax.jit` make ``fps`` static and donate ``stream``.
+
+    Args:
+        dresser: From `make_dresser`.
+        stream: From `start_clothing` or the frame before.
+        rotations: Joint rotations of this frame.
+        root: Position of the root joint [m].
+        fps: Frames a second.
+
+    Returns:
+        The stream for the next frame, and vertices [m] by garment's name.
+    """
+    world, shift = dresser.body.transforms(dresser.rest, rotations, root)
+    stream, raw = stream_frame(dresser.predictor, dresser.wearables, stream, world, shift, fps)
+    out = {}
+    for w, x, patch in zip(dresser.wearables, raw, dresser.patches, strict=True):
+        out[w.name] = push_out(patch, x, world, shift) if dresser.resolve else x
+    return stream, out

@@ -1,0 +1,118 @@
+"""Clothes as a layer: live, batched, differentiated and exported, always the same."""
+
+import json
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.dressing import (
+    clothe,
+    clothe_frame,
+    dress,
+    export_dresser,
+    make_dresser,
+    start_clothing,
+)
+from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.motion import load_motion
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def motion():
+    m = load_motion("punch", fps=30.0)
+    return m.rotations[8 : 8 + FRAMES], m.root[8 : 8 + FRAMES]
+
+
+@pytest.fixture(scope="module")
+def dresser():
+    return make_dresser(["bottom"])
+
+
+@pytest.fixture(scope="module")
+def whole(dresser, motion):
+    return jax.jit(clothe, static_argnames="fps")(dresser, *motion, fps=30.0)
+
+
+def test_the_layer_gives_what_dress_gives(whole, motion):
+    from physxnet_jax.motion import make_motion
+
+    clip = make_motion(*(np.asarray(x) for x in motion), 30.0)
+    positions = dress(clip, ["bottom"], include_body=False).garments[0].positions
+    np.testing.assert_allclose(np.asarray(whole["bottom"]), positions, atol=1e-5)
+
+
+def test_a_frame_at_a_time_is_the_clip(dresser, whole, motion):
+    step = jax.jit(clothe_frame, static_argnames="fps", donate_argnames="stream")
+    rotations, root = motion
+    stream = start_clothing(dresser, rotations[0], root[0])
+    for k in range(FRAMES):
+        stream, cloth = step(dresser, stream, rotations[k], root[k], fps=30.0)
+        np.testing.assert_allclose(
+            np.asarray(cloth["bottom"]), np.asarray(whole["bottom"][k]), atol=1e-5
+        )
+
+
+def test_people_are_batched_by_vmap(dresser, whole, motion):
+    rotations, root = motion
+    crowd = jnp.stack([root, root + jnp.array([[1.0, 0.0, 2.0]])])
+    out = jax.jit(jax.vmap(lambda p: clothe(dresser, rotations, p, 30.0)))(crowd)["bottom"]
+    np.testing.assert_allclose(np.asarray(out[0]), np.asarray(whole["bottom"]), atol=1e-5)
+    moved = np.asarray(out[1]) - np.array([1.0, 0.0, 2.0], np.float32)
+    np.testing.assert_allclose(moved, np.asarray(whole["bottom"]), atol=1e-4)
+
+
+def test_the_root_pulls_the_cloth_along(dresser, motion):
+    """The mean height of the cloth rises with the root, one for one, whatever is between."""
+    rotations, root = motion
+
+    @jax.jit
+    def height(lift):
+        cloth = clothe(dresser, rotations, root + lift * jnp.array([[0.0, 1.0, 0.0]]), 30.0)
+        return jnp.mean(cloth["bottom"][..., 1])
+
+    value, slope = jax.jvp(height, (jnp.float32(0.0),), (jnp.float32(1.0),))
+    assert np.isfinite(value)
+    assert float(slope) == pytest.approx(1.0, abs=2e-3)
+    assert float(jax.grad(height)(jnp.float32(0.0))) == pytest.approx(1.0, abs=2e-3)
+
+
+def test_an_export_runs_without_this_package(dresser, whole, motion, tmp_path):
+    pytest.importorskip("flatbuffers")
+    files = export_dresser(tmp_path / "out", dresser, platforms=("cpu",), name="local")
+    assert all(f.is_file() for f in files)
+    card = json.loads((tmp_path / "out" / "card.json").read_text())
+    assert card["garments"] == {"bottom": 2726} and card["weights"]["name"] == "local"
+    faces = np.load(tmp_path / "out" / "garments.npz")["bottom_faces"]
+    assert faces.max() == 2725
+    np.savez(tmp_path / "motion.npz", rotations=motion[0], root=motion[1])
+    script = tmp_path / "use.py"
+    script.write_text(
+        "import sys, numpy as np\n"
+        "sys.modules['physxnet_jax'] = None\n"
+        f"sys.path.insert(0, {str(tmp_path / 'out')!r})\n"
+        "from dress import load\n"
+        f"m = np.load({str(tmp_path / 'motion.npz')!r})\n"
+        f"run = load({str(tmp_path / 'out')!r})\n"
+        "short = run(m['rotations'][:2], m['root'][:2])['bottom']\n"
+        "assert short.shape[0] == 2\n"
+        f"np.save({str(tmp_path / 'cloth.npy')!r}, run(m['rotations'], m['root'])['bottom'])\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    np.testing.assert_allclose(
+        np.load(tmp_path / "cloth.npy"), np.asarray(whole["bottom"]), atol=1e-5
+    )
+    (tmp_path / "out" / "dresser.jaxexport").write_bytes(b"spoiled")
+    done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
+    assert done.returncode != 0 and "damaged" in done.stderr
+
+
+def test_garments_without_a_decoder_are_named():
+    with pytest.raises(PhysXNetError, match="one of top, bottom, dress"):
+        make_dresser(["cape"])
