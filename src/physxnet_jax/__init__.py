@@ -16,7 +16,15 @@ if _sys.argv[1:2] != ["doctor"]:
     _check_jaxlib()
 
 from .body import Body as Body, load_body as load_body
-from .dressing import DressedClip as DressedClip, dress as dress
+from .dressing import (
+    DressedClip as DressedClip,
+    Dresser as Dresser,
+    clothe as clothe,
+    clothe_frame as clothe_frame,
+    dress as dress,
+    make_dresser as make_dresser,
+    start_clothing as start_clothing,
+)
 from .errors import PhysXNetError as PhysXNetError
 from .garment import Fabric as Fabric, Garment as Garment, template as template
 from .io import (
@@ -37,6 +45,7 @@ from .uv import bind as bind, make_atlas as make_atlas
 __all__ = [
     "Body",
     "DressedClip",
+    "Dresser",
     "Fabric",
     "Garment",
     "Motion",
@@ -45,6 +54,8 @@ __all__ = [
     "Scene",
     "__version__",
     "bind",
+    "clothe",
+    "clothe_frame",
     "dress",
     "dress_frames",
     "load_body",
@@ -52,9 +63,11 @@ __all__ = [
     "load_motion",
     "load_predictor",
     "make_atlas",
+    "make_dresser",
     "make_wearable",
     "pad_clip",
     "simulate",
+    "start_clothing",
     "template",
     "write_clip",
 ]

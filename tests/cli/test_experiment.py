@@ -6,6 +6,7 @@ import pytest
 
 from physxnet_jax.cli import main
 from physxnet_jax.data import list_sequences, read_log
+from physxnet_jax.dressing import EXPORTED
 
 DATASET = """
 from physxnet_jax.data import DatasetConfig
@@ -87,3 +88,14 @@ def test_a_configuration_that_is_none_is_refused(tmp_path, capsys):
     path.write_text(DATASET)
     assert main(["dataset", "build", str(path), "--out", "x", "--shard", "2/2"]) == 2
     assert "0 <= i < n" in capsys.readouterr().err
+
+
+def test_clothes_are_exported_by_a_command(tmp_path, capsys):
+    pytest.importorskip("flatbuffers")
+    out = tmp_path / "dresser"
+    assert main(["export", "--wear", "bottom", "--out", str(out), "--platforms", "cpu"]) == 0
+    assert "wrote" in capsys.readouterr().out
+    assert {p.name for p in out.iterdir()} == set(EXPORTED)
+    assert main(["export", "--wear", "cape", "--out", str(tmp_path / "no")]) == 2
+    assert "one of top, bottom, dress" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()

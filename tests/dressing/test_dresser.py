@@ -113,6 +113,12 @@ def test_an_export_runs_without_this_package(dresser, whole, motion, tmp_path):
     assert done.returncode != 0 and "damaged" in done.stderr
 
 
+def test_unknown_platforms_are_named(dresser, tmp_path):
+    with pytest.raises(PhysXNetError, match="no platform 'toaster'; there are cpu"):
+        export_dresser(tmp_path / "out", dresser, platforms=("cpu", "toaster"))
+    assert not (tmp_path / "out").exists()
+
+
 def test_garments_without_a_decoder_are_named():
     with pytest.raises(PhysXNetError, match="one of top, bottom, dress"):
         make_dresser(["cape"])

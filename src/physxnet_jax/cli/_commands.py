@@ -267,6 +267,32 @@ class Train:
 
 
 @dataclasses.dataclass(frozen=True)
+class Export:
+    """Write clothes as one function that needs jax alone: joint rotations to vertices.
+
+    Examples:
+      physxnet export --wear top bottom --out out/dresser
+    """
+
+    out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for the function (StableHLO), triangles, a card and a loader."""
+    wear: tuple[str, ...] = ("top", "bottom")
+    """Garments: OBJ files or top, bottom, dress."""
+    weights: str = "local"
+    """Name or folder of network weights."""
+    fps: float = 30.0
+    """Frames a second that it will be asked for."""
+    push_out: bool = True
+    """Push vertices that end inside the body onto it."""
+    platforms: tuple[str, ...] = ("cpu", "cuda")
+    """Where it will run."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Evaluate:
     """The error of methods on every action of a dataset, beside what each costs.
 

@@ -18,6 +18,7 @@ from ._commands import (
     Dress,
     Effects,
     Evaluate,
+    Export,
     Simulate,
     Stress,
     Train,
@@ -37,6 +38,7 @@ _Command = (
     | Annotated[Dataset, tyro.conf.subcommand("dataset")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
 )
 
 
@@ -86,11 +88,16 @@ def _run(
     | Stress
     | Dataset
     | Train
-    | Evaluate,
+    | Evaluate
+    | Export,
     console: Console,
 ) -> int:
     if isinstance(command, Dataset | Train | Evaluate):
         return _experiment(command, Console(quiet=True) if command.quiet else console)
+    if isinstance(command, Export):
+        from ._export import export
+
+        return export(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Bench):
         from ._bench import bench
 

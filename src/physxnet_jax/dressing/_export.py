@@ -11,13 +11,15 @@ import numpy as np
 from jax import export
 
 from ..data import CARD
-from ..errors import MissingDependencyError
+from ..errors import MissingDependencyError, PhysXNetError
 from ..files import whole_file
 from ..io import read_card
 from ._dresser import Dresser, clothe
 
 EXPORTED = ("dresser.jaxexport", "garments.npz", "card.json", "dress.py")
 """Files of an export."""
+
+_PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 _LOADER = '''"""Clothes from joint rotations: needs jax, numpy and flatbuffers, nothing else.
 
@@ -71,7 +73,13 @@ def export_dresser(
 
     Raises:
         MissingDependencyError: Without flatbuffers, by which jax writes exports.
+        PhysXNetError: A platform that jax doesn't know.
     """
+    unknown = set(platforms) - set(_PLATFORMS)
+    if unknown or not platforms:
+        raise PhysXNetError(
+            f"no platform '{', '.join(sorted(unknown))}'; there are {', '.join(_PLATFORMS)}."
+        )
     try:
         import flatbuffers  # noqa: F401
     except ImportError as error:

@@ -1,0 +1,23 @@
+"""`physxnet export`: clothes as one function that needs jax alone."""
+
+from rich.console import Console
+
+from ..dressing import export_dresser, make_dresser
+from ._commands import Export
+
+
+def export(command: Export, console: Console) -> int:
+    """Writes the function and says how to call it."""
+    with console.status("binding and lowering"):
+        dresser = make_dresser(command.wear, weights=command.weights, resolve=command.push_out)
+        files = export_dresser(
+            command.out,
+            dresser,
+            fps=command.fps,
+            platforms=command.platforms,
+            name=command.weights,
+        )
+    for file in files:
+        console.print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)", highlight=False)
+    console.print("use: from dress import load; cloth = load(FOLDER)(rotations, root)")
+    return 0
