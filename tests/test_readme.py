@@ -23,7 +23,7 @@ def test_every_command_parses_and_every_target_exists():
         assert (ROOT / path).is_file(), path
     words = set(re.findall(r"physxnet (\w+)", TEXT))
     there = {"dress", "demo", "doctor", "clips", "simulate", "effects", "bench", "stress"}
-    there |= {"dataset", "train", "evaluate"}
+    there |= {"dataset", "train", "evaluate", "export"}
     assert words <= there
     with pytest.raises(SystemExit):
         main(["undress"])
@@ -35,8 +35,13 @@ def test_the_table_is_the_measured_one():
     assert "| local |" in table and table.strip() in TEXT
 
 
-def test_the_python_example_runs(tmp_path, monkeypatch):
+def test_the_python_examples_run(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    code = re.search(r"```python\n(.*?)```", TEXT, re.S)
-    exec(code.group(1).replace("frames=30", "frames=3"), {})
+    blocks = re.findall(r"```python\n(.*?)```", TEXT, re.S)
+    assert len(blocks) == 2
+    there = {}
+    for code in blocks:
+        short = code.replace("frames=30", "frames=3").replace("rotations,", "rotations[:3],")
+        exec(short.replace("root,", "root[:3],"), there)
     assert (tmp_path / "walk.npz").is_file()
+    assert there["trousers"].shape == (3, 2726, 3)

@@ -4,8 +4,8 @@ Command: physxnet train experiments/configs/local_cpu.py --name local
          --data runs/ours --data runs/mirror --data runs/extra --data runs/extra_mirror
          --splits train extra --out runs/local
 Cost:    COST
-Result:  the rows `local` of experiments/results/test_errors.md. With the first two datasets
-         alone it learns from the paper's training actions only: the rows `local-22`.
+Result:  the rows `local` of experiments/results/test_errors.md. It has seen 16 actions that
+         the paper's protocol doesn't have; `local_22_cpu.py` has not.
 
 L1 alone: an adversarial loss costs a second network and isn't aimed at the error.
 """

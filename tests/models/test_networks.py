@@ -22,6 +22,7 @@ from physxnet_jax.models import (
     make_generator,
     make_surface,
     make_wearable,
+    normalise,
     pad_clip,
     pose_windows,
     skin_wearable,
@@ -316,6 +317,23 @@ def trained_like(surface, atlas, inputs, seed=0):
     one = jnp.ones((), jnp.float32)
     scales = Normalisation(one, 10 * one, {"top": 0.1 * one, "dress": 0.1 * one})
     return Predictor(atlas, surface, scales, state, graph, config)
+
+
+def test_features_beyond_any_motion_are_shortened_and_no_others(worn):
+    inputs = Inputs(frames=1, gravity=False)
+    two = jnp.full((), 2.0)
+    scales = Normalisation(two, two, {"top": two})
+    unit = np.array([[0.6, 0.0, 0.8]], np.float32)
+    lengths = (0.0, 1.0, 5.9, 6.1, 1e6, 1e30)
+    for length, wanted in zip(lengths, (0.0, 0.5, 2.95, 3.0, 3.0, 3.0)):
+        x = jnp.asarray(np.concatenate([length * unit, 0.1 * unit, 0.2 * unit], axis=1))
+        out = np.asarray(normalise(x, scales, inputs))
+        np.testing.assert_allclose(out[:, :3], wanted * unit, rtol=1e-5)
+        np.testing.assert_allclose(out[:, 3:6], 0.05 * unit, rtol=1e-6)
+        np.testing.assert_allclose(out[:, 6:], 0.2 * unit, rtol=1e-6)
+        grad = jax.grad(lambda v: jnp.sum(normalise(v, scales, inputs)))(x)
+        assert np.isfinite(grad).all()
+    assert np.isnan(np.asarray(normalise(x.at[0, 1].set(jnp.nan), scales, inputs))).any()
 
 
 def test_folded_networks_answer_as_before(worn):

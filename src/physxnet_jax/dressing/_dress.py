@@ -17,6 +17,7 @@ from ..motion import (
     Motion,
     clip_transforms,
     load_motion,
+    make_motion,
     resample,
     stand_on_floor,
 )
@@ -120,7 +121,8 @@ def dress(
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     with watch("motion"):
         if isinstance(motion, Motion):
-            clip = motion if motion.fps == fps else resample(motion, fps)
+            clip = make_motion(motion.rotations, motion.root, motion.fps, name=motion.name)
+            clip = clip if clip.fps == fps else resample(clip, fps)
             if shape is not None:
                 clip = stand_on_floor(body, clip, rest)
         else:

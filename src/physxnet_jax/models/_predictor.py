@@ -18,6 +18,9 @@ from ._features import Family, Inputs, clip_features, skin_points
 from ._networks import Generator
 
 _EXACT = jax.lax.Precision.HIGHEST
+# Normalised lengths beyond this are no motion of a person's; of 0.1 % of texels in training
+# a component exceeds 1. Places are in metres.
+_FARTHEST = 3.0
 # A skirt samples maps of both legs, whose edges don't meet: offsets are averaged over
 # about this distance along the cloth [m].
 _SMOOTH = 0.03
@@ -177,13 +180,32 @@ def normalise(
     normalisation: Normalisation,
     inputs: Inputs,
 ) -> Float[Array, "*batch texels channels"]:
-    """Features scaled to about [-1, 1], each kind by itself (PhysXNet, section 5.1)."""
+    """Features scaled to about [-1, 1], each kind by itself (PhysXNet, section 5.1).
+
+    A vector longer than `_FARTHEST` is shortened to it: a teleport is taken for a very
+    fast motion, not for one that no training could have shown. Finite features stay
+    finite, and so do gradients.
+    """
     one = jnp.ones((), jnp.float32)
     scales = {"velocity": normalisation.velocity, "acceleration": normalisation.acceleration}
-    row = jnp.concatenate(
-        [jnp.full((inputs.width(k),), one / scales.get(k, one)) for k in inputs.kinds]
-    )
-    return features * row.reshape((1,) * (features.ndim - 1) + (-1,))
+    out, start = [], 0
+    for kind in inputs.kinds:
+        values = features[..., start : start + inputs.width(kind)] / scales.get(kind, one)
+        out.append(_shortened(values))
+        start += inputs.width(kind)
+    return jnp.concatenate(out, axis=-1)
+
+
+def _shortened(values: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
+    vectors = values.reshape(*values.shape[:-1], -1, 3)
+    # Scaled first: the square of a huge number must not overflow.
+    largest = jnp.max(jnp.abs(vectors), axis=-1, keepdims=True)
+    far = largest > _FARTHEST
+    shrunk = vectors / jnp.where(far, largest, jnp.ones_like(largest))
+    squared = jnp.sum(shrunk * shrunk, axis=-1, keepdims=True)
+    over = far | (squared > _FARTHEST**2)
+    length = jnp.sqrt(jnp.where(over, squared, jnp.ones_like(squared)))
+    return jnp.where(over, _FARTHEST * shrunk / length, vectors).reshape(values.shape)
 
 
 def make_generator(config: ModelConfig, *, seed: int = 0) -> Generator:

@@ -1,0 +1,168 @@
+"""The learned path where it is hard: value, tangent and cotangent stay finite and bounded."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.body import load_body
+from physxnet_jax.dressing import clothe, dress, make_dresser
+from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.models import skin_wearable
+from physxnet_jax.motion import Motion, load_motion
+
+FRAMES = 7
+# Cloth of a template is never this far from its skinning in any simulation [m].
+FAR = 0.8
+
+
+@pytest.fixture(scope="module")
+def dresser():
+    # The push-out has hard cases of its own.
+    return make_dresser(["bottom", "dress"], resolve=False)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    m = load_motion("walk", fps=30.0)
+    return m.rotations[:FRAMES], m.root[:FRAMES]
+
+
+@pytest.fixture(scope="module")
+def judge(dresser):
+    """Distances from skinning [m], and the derivatives of their sum."""
+
+    @jax.jit
+    def far(rotations, root, scale):
+        def total(rotations, root):
+            # Speed, not fps, is what changes: one program serves all cases.
+            cloth = clothe(dresser, rotations, root, 30.0)
+            out = {}
+            for w in dresser.wearables:
+                skinned = jax.vmap(
+                    lambda q, p, w=w: skin_wearable(w, *dresser.body.transforms(dresser.rest, q, p))
+                )(rotations, root)
+                out[w.name] = cloth[w.name] - skinned
+            return sum(jnp.sum(x * x) for x in out.values()) * scale, out
+
+        (value, out), grads = jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(
+            rotations, root
+        )
+        tangent = jax.jvp(lambda p: total(rotations, p)[0], (root,), (jnp.ones_like(root),))[1]
+        return value, out, grads, tangent
+
+    return lambda q, p: far(q, p, jnp.float32(1.0))
+
+
+def still(q, p):
+    return jnp.repeat(q[:1], FRAMES, axis=0), jnp.repeat(p[:1], FRAMES, axis=0)
+
+
+def teleport(q, p):
+    return q, p.at[4:, 0].add(10.0)
+
+
+def fast(q, p):
+    """Every second frame turned half round: fifty times as fast as anyone turns."""
+    half = jnp.array([0.0, 0.0, 1.0, 0.0])
+    return q.at[::2, 0].set(jnp.broadcast_to(half, q[::2, 0].shape)), 50.0 * p
+
+
+def far_away(q, p):
+    return q, p + jnp.array([[3e3, 0.0, -3e3]])
+
+
+def mirrored_quaternions(q, p):
+    """q and -q are the same rotation."""
+    return jnp.where(jnp.arange(FRAMES)[:, None, None] % 2 == 0, q, -q), p
+
+
+@pytest.mark.parametrize("case", [still, teleport, fast, far_away, mirrored_quaternions])
+def test_cloth_stays_near_and_differentiable(judge, motion, case):
+    value, out, grads, tangent = judge(*case(*motion))
+    assert np.isfinite(value) and np.isfinite(tangent)
+    for x in out.values():
+        assert np.isfinite(x).all() and np.linalg.norm(x, axis=2).max() < FAR
+    assert all(np.isfinite(g).all() for g in grads)
+
+
+def test_without_the_limit_a_teleport_tears_the_clothes_off(dresser, motion, monkeypatch):
+    monkeypatch.setattr("physxnet_jax.models._predictor._FARTHEST", 1e9)
+    q, p = motion
+    near, gone = (
+        jax.jit(lambda p: clothe(dresser, q, p, 30.0)["dress"] - p[:, None])(x)
+        for x in (p, teleport(q, p)[1])
+    )
+    assert float(jnp.linalg.norm(gone - near, axis=2).max()) > FAR
+
+
+def test_standing_still_is_a_fixed_point(judge, motion):
+    _, out, _, _ = judge(*still(*motion))
+    for x in out.values():
+        np.testing.assert_allclose(np.asarray(x), np.asarray(x[:1]).repeat(FRAMES, 0), atol=1e-6)
+
+
+def test_signs_of_quaternions_change_nothing(judge, motion):
+    _, plain, _, _ = judge(*motion)
+    _, flipped, _, _ = judge(*mirrored_quaternions(*motion))
+    for name, x in plain.items():
+        np.testing.assert_allclose(np.asarray(flipped[name]), np.asarray(x), atol=1e-5)
+
+
+def test_a_spoiled_frame_is_seen_in_its_window_alone(dresser, judge, motion):
+    """The frames whose window holds it are NaN and say so; all others are untouched."""
+    q, p = motion
+    _, clean, _, _ = judge(q, p)
+    _, out, _, _ = judge(q, p.at[1].set(jnp.nan))
+    window = dresser.predictor.config.inputs.window
+    assert window == 5
+    seen = np.arange(FRAMES)
+    spoiled = (seen >= 1) & (seen < 1 + window)
+    for name, x in out.items():
+        whole = np.isfinite(np.asarray(x)).all(axis=(1, 2))
+        np.testing.assert_array_equal(whole, ~spoiled)
+        np.testing.assert_allclose(
+            np.asarray(x)[~spoiled], np.asarray(clean[name])[~spoiled], atol=1e-5
+        )
+
+
+def test_a_spoiled_motion_is_refused_on_the_host(motion):
+    q, p = motion
+    for bad in (Motion(q, p.at[2].set(jnp.nan), 30.0), Motion(q.at[3, 4].set(jnp.inf), p, 30.0)):
+        with pytest.raises(PhysXNetError, match="finite"):
+            dress(bad, ["bottom"], method="lbs")
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"gender": 1.0, "height_up": 1.0, "weight_up": 1.0},
+        {"height_down": 1.0, "weight_down": 1.0},
+    ],
+    ids=["huge", "tiny"],
+)
+def test_extreme_bodies_wear_it_too(motion, values):
+    shape = load_body().shape(**values)
+    clip = Motion(*motion, 30.0)
+    worn = {m: dress(clip, ["dress"], method=m, shape=shape) for m in ("network", "lbs")}
+    gap = worn["network"].garments[0].positions - worn["lbs"].garments[0].positions
+    assert np.isfinite(gap).all() and np.linalg.norm(gap, axis=2).max() < FAR
+
+
+def test_a_degenerate_triangle_harms_no_other(motion):
+    from physxnet_jax.garment import template
+
+    garment = template("bottom")
+    faces = np.asarray(garment.mesh.faces).copy()
+    spoiled = np.concatenate([faces, faces[:1, [0, 0, 1]]]).astype(faces.dtype)
+    mesh = dataclasses.replace(garment.mesh, faces=jnp.asarray(spoiled))
+    if garment.mesh.uv_faces is not None:
+        uv = np.asarray(garment.mesh.uv_faces)
+        mesh = dataclasses.replace(mesh, uv_faces=jnp.asarray(np.concatenate([uv, uv[:1]])))
+    worn = [
+        dress(Motion(*motion, 30.0), [g], include_body=False).garments[0].positions
+        for g in (garment, dataclasses.replace(garment, mesh=mesh))
+    ]
+    np.testing.assert_allclose(worn[1], worn[0], atol=1e-4)
