@@ -78,6 +78,26 @@ def main() -> None:
             part.write_text(text)
     for name in NETWORKS:
         note_measured(name, rows)
+    write_ladder(rows)
+
+
+def write_ladder(rows: list[ActionError]) -> None:
+    """The errors by which `physxnet dress --budget-ms` chooses."""
+    # The teacher itself is as far from itself as two of its runs part.
+    names = {n: n for n in ("lbs", "local", "local+push", "draft")} | {"noise": "standard"}
+    rungs = []
+    for method, name in names.items():
+        found = {t: m for t in TEMPLATES if (m := means(rows, method, t, "physxnet"))}
+        if len(found) == len(TEMPLATES):
+            rungs.append(
+                {
+                    "name": name,
+                    "rmse_mm": {t: round(m["rmse_vertices_mm"], 2) for t, m in found.items()},
+                    "inside": {t: round(m["penetration_share"], 5) for t, m in found.items()},
+                }
+            )
+    with whole_file(ROOT / "src/physxnet_jax/dressing/ladder.json") as part:
+        part.write_text(json.dumps(rungs, indent=1) + "\n")
 
 
 def note_datasets(folder: pathlib.Path) -> None:

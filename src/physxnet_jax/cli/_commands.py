@@ -15,6 +15,7 @@ class Dress:
       physxnet dress walk --wear top bottom -o walk.usdc
       physxnet dress 02_04.amc --wear dress --preview dress.mp4
       physxnet dress dance.bvh --wear my_shirt.obj bottom --method simulate -o out.pc2
+      physxnet dress walk --wear dress --budget-ms 5 -o walk.usdc
     """
 
     motion: tyro.conf.Positional[str]
@@ -27,6 +28,12 @@ class Dress:
     """Picture or video: .png, .gif or .mp4."""
     method: Literal["network", "lbs", "simulate"] = "network"
     """network (packaged weights), lbs (skinning alone) or simulate (the teacher)."""
+    accuracy: Literal["draft", "standard", "fine"] = "standard"
+    """Of simulate."""
+    budget_ms: float | None = None
+    """Pick the method: the most accurate within this time a frame on this machine."""
+    max_error_mm: float | None = None
+    """Pick the method: the fastest within this error on the test actions."""
     fps: float = 30.0
     """Frames a second of the result."""
     frames: int | None = None
@@ -67,6 +74,24 @@ class Demo:
 class Doctor:
     """Print versions, devices and optional parts; refuse a jaxlib that miscomputes."""
 
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibrate:
+    """Time every way to dress on this machine, once; --budget-ms chooses by it.
+
+    Times are kept in $XDG_CACHE_HOME or ~/.cache. Stopped, it goes on where it was.
+
+    Examples:
+      physxnet calibrate
+    """
+
+    again: bool = False
+    """Forget what was measured before."""
+    quiet: bool = False
+    """Print nothing but errors."""
     debug: bool = False
     """Show the trace of an error."""
 

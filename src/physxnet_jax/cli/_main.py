@@ -11,6 +11,7 @@ from rich.console import Console
 from ..errors import BrokenInstallError, PhysXNetError
 from ._commands import (
     Bench,
+    Calibrate,
     Clips,
     Dataset,
     Demo,
@@ -38,6 +39,7 @@ _Command = (
     | Annotated[Dataset, tyro.conf.subcommand("dataset")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Export, tyro.conf.subcommand("export")]
 )
 
@@ -71,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Console(stderr=True, soft_wrap=True).print(f"physxnet: {error}", style="red", markup=False)
         return 2
     except KeyboardInterrupt:
-        goes_on = isinstance(command, Simulate | Dataset | Train | Evaluate)
+        goes_on = isinstance(command, Simulate | Dataset | Train | Evaluate | Calibrate)
         left = "what is done is kept for the next run" if goes_on else ""
         Console(stderr=True).print(f"physxnet: stopped; {left or 'nothing half-written is left'}.")
         return 130
@@ -89,11 +91,16 @@ def _run(
     | Dataset
     | Train
     | Evaluate
-    | Export,
+    | Export
+    | Calibrate,
     console: Console,
 ) -> int:
     if isinstance(command, Dataset | Train | Evaluate):
         return _experiment(command, Console(quiet=True) if command.quiet else console)
+    if isinstance(command, Calibrate):
+        from ._calibrate import calibrate
+
+        return calibrate(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Export):
         from ._export import export
 
@@ -152,6 +159,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     from ..io import check_output, write_clip
     from ..motion import load_motion
     from ..viewer import check_preview, render_preview
+    from ._calibrate import choose
     from ._table import closing_table
 
     # Say what can't be written before minutes are spent.
@@ -170,17 +178,24 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
             skeleton=command.skeleton,
             shape=shape,
         )
+        ways = {
+            "method": command.method,
+            "accuracy": command.accuracy,
+            "weights": command.weights,
+            "resolve": command.push_out,
+        }
+        picked = choose(command, progress)
+        if picked is not None:
+            ways |= picked.rung.options
         clip = dress(
             motion,
             command.wear,
-            method=command.method,
             fps=command.fps,
             frames=command.frames,
-            weights=command.weights,
             shape=shape,
             include_body=command.body,
-            resolve=command.push_out,
             progress=progress,
+            **ways,
         )
         written: list[pathlib.Path] = []
         if command.out is not None:
@@ -192,6 +207,8 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
         console.print(table)
     for note in clip.notes:
         console.print(note)
+    if picked is not None:
+        console.print(picked.told, highlight=False)
     for path in written:
         console.print(f"wrote {path} (import at {clip.fps:g} fps)", highlight=False)
     return 0

@@ -17,6 +17,14 @@ from ._dresser import (
     start_clothing as start_clothing,
 )
 from ._export import EXPORTED as EXPORTED, export_dresser as export_dresser
+from ._ladder import (
+    Choice as Choice,
+    Rung as Rung,
+    calibrate as calibrate,
+    calibration_file as calibration_file,
+    load_ladder as load_ladder,
+    pick_rung as pick_rung,
+)
 from ._meshes import animated_meshes as animated_meshes
 from ._method import pushed_network as pushed_network
 from ._push_out import (

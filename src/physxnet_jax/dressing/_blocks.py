@@ -14,7 +14,7 @@ from ..body import Body
 from ..garment import Garment
 from ..models import Predictor, Wearable, dress_frames, skin_wearable
 from ..motion import BLOCK, Motion, padded_block
-from ..simulation import Scene, prepare_scene, simulate_batch, standard_effects
+from ..simulation import ACCURACY, Scene, prepare_scene, simulate_batch, standard_effects
 from ._push_out import SkinPatch, push_out, skin_height
 from ._stages import Stage
 
@@ -97,6 +97,7 @@ def simulate_clip(
     clip: Motion,
     body: Body,
     shape: Any | None,
+    accuracy: str,
     stages: list[Stage],
     progress: Callable[[str, int, int], None] | None,
 ) -> dict[str, np.ndarray]:
@@ -109,7 +110,8 @@ def simulate_clip(
 
     order = inside_out(garments)
     scene = Scene(tuple(order), standard_effects(len(order)), body, shape)
-    rollout = simulate_batch(prepare_scene(scene), [clip], progress=tick)[0]
+    solver = ACCURACY[accuracy]
+    rollout = simulate_batch(prepare_scene(scene), [clip], solver=solver, progress=tick)[0]
     rollout.check()
     laps = 1e3 * np.diff(ticks)
     warm = float(np.median(laps[1:])) / 10 if len(laps) > 1 else None

@@ -21,6 +21,7 @@ from ..motion import (
     resample,
     stand_on_floor,
 )
+from ..simulation import ACCURACY
 from ..uv import Binding, Transference, bind
 from ._blocks import inside_share, predict_clip, simulate_clip
 from ._meshes import animated_meshes, with_names
@@ -75,6 +76,7 @@ def dress(
     wear: Sequence[Garment | str | pathlib.Path] = ("top", "bottom"),
     *,
     method: Method = "network",
+    accuracy: str = "standard",
     fps: float | int = 30.0,
     frames: int | None = None,
     weights: str | pathlib.Path = DEFAULT,
@@ -91,6 +93,7 @@ def dress(
         wear: Garments, OBJ files or template names.
         method: ``network`` (packaged weights), ``lbs`` (skinning alone, the baseline)
             or ``simulate`` (the cloth simulator, the network's teacher).
+        accuracy: Of ``simulate``: ``draft``, ``standard`` or ``fine``.
         fps: Frames a second of the result.
         frames: Keep only this many frames.
         weights: Name or folder of network weights.
@@ -113,6 +116,8 @@ def dress(
     """
     if method not in METHODS:
         raise PhysXNetError(f"No method '{method}'; there are {', '.join(METHODS)}.")
+    if accuracy not in ACCURACY:
+        raise PhysXNetError(f"No accuracy '{accuracy}'; there are {', '.join(ACCURACY)}.")
     if frames is not None and frames < 1:
         raise PhysXNetError(f"frames is {frames}; ask for at least one.")
     stages: list[Stage] = []
@@ -153,7 +158,7 @@ def dress(
         wearables,
     )
     if method == "simulate":
-        positions = simulate_clip(garments, clip, body, shape, stages, progress)
+        positions = simulate_clip(garments, clip, body, shape, accuracy, stages, progress)
     else:
         positions = predict_clip(
             predictor, wearables, patches, world, shift, clip.fps, resolve, stages, progress

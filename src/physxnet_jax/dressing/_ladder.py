@@ -1,0 +1,221 @@
+"""What accuracy costs here: the ways to dress, their measured errors, and this machine's times."""
+
+import dataclasses
+import importlib.metadata
+import importlib.resources
+import json
+import os
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+
+from ..errors import PhysXNetError
+from ..evaluation import Method as Measured, Simulator, network, skinning
+from ..files import whole_file
+from ..garment import TEMPLATES, Template
+from ..io import load_predictor, read_card
+from ..motion import Motion, load_motion
+from ..simulation import ACCURACY
+from ._method import pushed_network
+
+_FRAMES = 64
+
+
+@dataclasses.dataclass(frozen=True)
+class Rung:
+    """A way to dress, with its error on the twelve test actions of the paper's protocol.
+
+    Attributes:
+        name: ``lbs``, a name of weights, one with ``+push``, or an accuracy of the
+            simulator.
+        rmse_mm: Root mean square distance of vertices from the simulation at its
+            ``standard`` setting [mm], by template.
+        inside: Share of vertices inside the body that have room outside, by template.
+    """
+
+    name: str
+    rmse_mm: dict[str, float]
+    inside: dict[str, float]
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The arguments by which `dress` takes this rung."""
+        if self.name == "lbs":
+            return {"method": "lbs", "resolve": False}
+        if self.name in ACCURACY:
+            return {"method": "simulate", "accuracy": self.name}
+        weights = self.name.removesuffix("+push")
+        return {"method": "network", "weights": weights, "resolve": weights != self.name}
+
+    @property
+    def identity(self) -> str:
+        """Changes when what is timed changes."""
+        if self.name == "lbs" or self.name in ACCURACY:
+            return self.name
+        card = read_card(self.name.removesuffix("+push"))
+        return f"{self.name} {card['sha256'][:12]}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """A rung that was picked, and what that means.
+
+    Attributes:
+        rung: Which.
+        ms_per_frame: Its time on this machine for the garments asked for [ms].
+        rmse_mm: Its mean error over them [mm].
+        told: A sentence for the user.
+    """
+
+    rung: Rung
+    ms_per_frame: float
+    rmse_mm: float
+    told: str
+
+
+def load_ladder() -> list[Rung]:
+    """The rungs whose errors the package knows."""
+    path = importlib.resources.files(__name__.rpartition(".")[0]) / "ladder.json"
+    return [Rung(**r) for r in json.loads(path.read_text())]
+
+
+def calibration_file() -> pathlib.Path:
+    """Where this machine's times are kept: $XDG_CACHE_HOME or ~/.cache."""
+    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    return pathlib.Path(home) / "physxnet_jax" / "calibration.json"
+
+
+def calibrate(
+    rungs: Sequence[Rung],
+    *,
+    path: pathlib.Path | None = None,
+    frames: int = _FRAMES,
+    report: Callable[[str, int, int], None] | None = None,
+) -> dict[str, dict[str, float]]:
+    """Times of rungs on this machine, each measured once and then kept.
+
+    Args:
+        rungs: What is timed.
+        path: Where times are kept; `calibration_file` by default.
+        frames: Frames of the built-in walk that are dressed for it.
+        report: Called with a text, measurements done and in all.
+
+    Returns:
+        For each rung and template, median milliseconds a frame after warm-up, from joint
+        rotations to vertices, one garment at a time.
+    """
+    path = calibration_file() if path is None else path
+    here = _machine()
+    kept = _read(path)
+    times: dict[str, Any] = kept["times"] if kept.get("machine") == here else {}
+    walk = load_motion("walk", fps=30.0)
+    walk = Motion(walk.rotations[:frames], walk.root[:frames], walk.fps, walk.name)
+    jobs: list[tuple[Rung, Template]] = [(r, t) for r in rungs for t in TEMPLATES if t in r.rmse_mm]
+    methods: dict[str, Measured] = {}
+    for k, (rung, name) in enumerate(jobs):
+        if report is not None:
+            report(f"timing {rung.name}, {name}", k, len(jobs))
+        known = times.setdefault(rung.identity, {})
+        if name in known:
+            continue
+        if rung.name not in methods:
+            methods = {rung.name: _method(rung.name)}
+        known[name] = methods[rung.name](walk, name).ms_per_frame
+        with whole_file(path) as part:
+            part.write_text(json.dumps({"machine": here, "times": times}, indent=1) + "\n")
+    return {r.name: times[r.identity] for r in rungs}
+
+
+def pick_rung(
+    templates: Sequence[str],
+    times: Mapping[str, Mapping[str, float]],
+    rungs: Sequence[Rung],
+    *,
+    budget_ms: float | None = None,
+    max_error_mm: float | None = None,
+) -> Choice:
+    """The most accurate rung within a time, or the fastest within an error.
+
+    Args:
+        templates: Templates of the garments that will be worn, one for each.
+        times: From `calibrate`.
+        rungs: What there is to choose from.
+        budget_ms: Milliseconds a frame for all garments together.
+        max_error_mm: Mean error over the garments [mm].
+
+    Raises:
+        PhysXNetError: Nothing is that fast or that accurate; the text says what comes
+            nearest.
+    """
+    if (budget_ms is None) == (max_error_mm is None):
+        raise PhysXNetError("give either a time (budget_ms) or an error (max_error_mm).")
+    if not templates:
+        raise PhysXNetError("nothing is worn: there is nothing to choose.")
+
+    def cost(r: Rung) -> float:
+        return sum(times[r.name][t] for t in templates)
+
+    def error(r: Rung) -> float:
+        return sum(r.rmse_mm[t] for t in templates) / len(templates)
+
+    able = [r for r in rungs if r.name in times and all(t in r.rmse_mm for t in templates)]
+    if not able:
+        raise PhysXNetError(f"no rung has all of {', '.join(templates)}.")
+    if budget_ms is not None:
+        within = [r for r in able if cost(r) <= budget_ms]
+        # Equally accurate to a tenth of a millimetre: fewer vertices inside wins.
+        best = min(
+            within,
+            key=lambda r: (round(error(r), 1), sum(r.inside[t] for t in templates)),
+            default=None,
+        )
+        nearest = min(able, key=cost)
+        asked = f"{budget_ms:g} ms a frame"
+    else:
+        assert max_error_mm is not None
+        within = [r for r in able if error(r) <= max_error_mm]
+        best = min(within, key=cost, default=None)
+        nearest = min(able, key=error)
+        asked = f"an error of {max_error_mm:g} mm"
+    if best is None:
+        raise PhysXNetError(
+            f"nothing here dresses {', '.join(templates)} within {asked}; the nearest is"
+            f" {nearest.name}: {cost(nearest):.2f} ms a frame, {error(nearest):.1f} mm."
+        )
+    told = (
+        f"picked {best.name}: {cost(best):.2f} ms a frame on this machine (calibrated),"
+        f" {error(best):.1f} mm from the simulation on the test actions"
+    )
+    better = [r for r in able if error(r) < error(best) - 0.05]
+    if better:
+        finer = min(better, key=cost)
+        told += f"; {finer.name} would take {cost(finer):.2f} ms for {error(finer):.1f} mm"
+    return Choice(best, cost(best), error(best), told)
+
+
+def _method(name: str) -> Measured:
+    if name == "lbs":
+        return skinning()
+    if name in ACCURACY:
+        return Simulator(name)
+    predictor = load_predictor(name.removesuffix("+push"))
+    return pushed_network(predictor) if name.endswith("+push") else network(predictor)
+
+
+def _machine() -> dict[str, Any]:
+    return {
+        "device": jax.devices()[0].device_kind,
+        "cores": os.cpu_count(),
+        "jax": jax.__version__,
+        "version": importlib.metadata.version("physxnet-jax"),
+    }
+
+
+def _read(path: pathlib.Path) -> dict[str, Any]:
+    try:
+        kept = json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError):
+        return {}
+    return kept if isinstance(kept, dict) and isinstance(kept.get("times"), dict) else {}

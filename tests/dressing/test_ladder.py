@@ -1,0 +1,117 @@
+"""The ladder: what is picked is within what was asked, and nothing is timed twice."""
+
+import json
+
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from physxnet_jax.cli import main
+from physxnet_jax.dressing import Rung, calibrate, dress, load_ladder, pick_rung
+from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.garment import TEMPLATES
+from physxnet_jax.io import list_weights
+from physxnet_jax.simulation import ACCURACY
+
+
+def rung(name, error, inside=0.0):
+    return Rung(name, dict.fromkeys(TEMPLATES, error), dict.fromkeys(TEMPLATES, inside))
+
+
+RUNGS = [rung("fast", 20.0), rung("dirty", 9.0, 0.05), rung("clean", 9.0), rung("exact", 1.0)]
+TIMES = {
+    n: dict.fromkeys(TEMPLATES, ms)
+    for n, ms in (("fast", 0.5), ("dirty", 2.0), ("clean", 4.0), ("exact", 90.0))
+}
+
+
+@pytest.mark.parametrize(
+    ("asked", "picked"),
+    [
+        ({"budget_ms": 1.0}, "fast"),
+        ({"budget_ms": 3.0}, "dirty"),
+        ({"budget_ms": 5.0}, "clean"),
+        ({"budget_ms": 1000.0}, "exact"),
+        ({"max_error_mm": 50.0}, "fast"),
+        ({"max_error_mm": 10.0}, "dirty"),
+        ({"max_error_mm": 2.0}, "exact"),
+    ],
+)
+def test_the_best_within_what_was_asked(asked, picked):
+    choice = pick_rung(["top"], TIMES, RUNGS, **asked)
+    assert choice.rung.name == picked and picked in choice.told
+    assert choice.ms_per_frame == TIMES[picked]["top"]
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(st.tuples(st.floats(0.1, 50), st.floats(0.1, 100)), min_size=1, max_size=6),
+    st.lists(st.sampled_from(TEMPLATES), min_size=1, max_size=3),
+    st.floats(0.05, 120),
+)
+def test_a_budget_is_kept_whatever_the_ladder(pairs, templates, budget):
+    rungs = [rung(str(k), e) for k, (e, _) in enumerate(pairs)]
+    times = {str(k): dict.fromkeys(TEMPLATES, ms) for k, (_, ms) in enumerate(pairs)}
+    able = [e for e, ms in pairs if ms * len(templates) <= budget]
+    if not able:
+        with pytest.raises(PhysXNetError, match="nearest"):
+            pick_rung(templates, times, rungs, budget_ms=budget)
+        return
+    choice = pick_rung(templates, times, rungs, budget_ms=budget)
+    assert choice.ms_per_frame <= budget * (1 + 1e-9)
+    assert choice.rmse_mm <= min(able) + 0.1
+
+
+def test_what_cannot_be_had_is_said():
+    with pytest.raises(PhysXNetError, match=r"nearest is fast: 1\.00 ms"):
+        pick_rung(["top", "dress"], TIMES, RUNGS, budget_ms=0.9)
+    with pytest.raises(PhysXNetError, match="nearest is exact"):
+        pick_rung(["top"], TIMES, RUNGS, max_error_mm=0.5)
+    with pytest.raises(PhysXNetError, match="either"):
+        pick_rung(["top"], TIMES, RUNGS, max_error_mm=5.0, budget_ms=5.0)
+    with pytest.raises(PhysXNetError, match="nothing is worn"):
+        pick_rung([], TIMES, RUNGS, budget_ms=5.0)
+
+
+def test_nothing_is_timed_twice_and_another_machine_is(tmp_path):
+    path = tmp_path / "deep" / "times.json"
+    said = []
+    times = calibrate([rung("lbs", 20.0)], path=path, frames=17, report=lambda *a: said.append(a))
+    assert set(times["lbs"]) == set(TEMPLATES) and all(ms > 0 for ms in times["lbs"].values())
+    assert len(said) == 3
+    known = json.loads(path.read_text())
+    known["times"]["lbs"]["top"] = 123.0
+    path.write_text(json.dumps(known))
+    assert calibrate([rung("lbs", 20.0)], path=path)["lbs"]["top"] == 123.0
+    known["machine"]["device"] = "abacus"
+    path.write_text(json.dumps(known))
+    assert calibrate([rung("lbs", 20.0)], path=path, frames=17)["lbs"]["top"] != 123.0
+    path.write_text("{")
+    assert calibrate([rung("lbs", 20.0)], path=path, frames=17)["lbs"]["top"] > 0
+
+
+def test_every_rung_of_the_package_can_be_dressed():
+    ladder = load_ladder()
+    names = {r.name for r in ladder}
+    assert {"lbs", "local", "local+push"} <= names
+    for r in ladder:
+        assert set(r.rmse_mm) == set(r.inside) == set(TEMPLATES)
+        assert r.name.removesuffix("+push") in {"lbs", *list_weights(), *ACCURACY}
+        assert r.identity.startswith(r.name)
+    plain = {r.name: r for r in ladder}
+    clip = dress("walk", ["bottom"], frames=2, include_body=False, **plain["local"].options)
+    assert clip.method == "network"
+    assert clip.inside["bottom"] == pytest.approx(clip.inside_raw["bottom"], rel=1e-4) != 0.0
+    with pytest.raises(PhysXNetError, match="draft, standard, fine"):
+        dress("walk", ["bottom"], method="simulate", accuracy="perfect")
+
+
+def test_dress_takes_what_was_picked(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr("physxnet_jax.cli._calibrate.load_ladder", lambda: [rung("lbs", 20.0)])
+    words = ["dress", "walk", "--wear", "bottom", "--frames", "2"]
+    assert main([*words, "--max-error-mm", "25"]) == 0
+    assert "picked lbs" in capsys.readouterr().out
+    assert main([*words, "--max-error-mm", "1"]) == 2
+    assert "nearest is lbs" in capsys.readouterr().err
+    assert main(["calibrate"]) == 0
+    assert "20.0" in capsys.readouterr().out
