@@ -3,12 +3,9 @@
 import dataclasses
 import json
 import math
-import os
 import pathlib
-import platform
 from typing import Any
 
-import jax
 from rich.console import Console
 from rich.table import Table
 
@@ -19,6 +16,7 @@ from ..io import load_garment
 from ..motion import load_motion
 from ..viewer import draw_work_precision
 from ._commands import Bench
+from ._machine import machine
 
 
 def bench(command: Bench, console: Console) -> int:
@@ -66,18 +64,12 @@ def _label(r: Work) -> str:
 
 
 def _write(path: pathlib.Path, rows: list[Work]) -> None:
-    machine = {
-        "cpu": platform.processor() or platform.machine(),
-        "cores": os.cpu_count(),
-        "device": jax.devices()[0].device_kind,
-        "jax": jax.__version__,
-    }
     data = [
         {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict.items()}
         for asdict in map(dataclasses.asdict, rows)
     ]
     with whole_file(path) as part:
-        part.write_text(json.dumps({"machine": machine, "rows": data}, indent=1) + "\n")
+        part.write_text(json.dumps({"machine": machine(), "rows": data}, indent=1) + "\n")
 
 
 def _from_json(row: dict[str, Any]) -> Work:

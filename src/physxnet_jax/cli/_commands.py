@@ -198,17 +198,28 @@ class Effects:
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """What accuracy costs in time: every solver and setting against a reference.
+    """What accuracy costs in time: solvers and settings, or networks and their sizes.
 
     Examples:
+      physxnet bench net --weights local paper --data runs/ours --out out/net.json
       physxnet bench sim --out out/sim_bench.json
       physxnet bench sim --scenes sheet
       physxnet bench sim --blender 5 10 15 20 --shirt shirt.obj --motion punch.bvh
       physxnet bench sim --newton 5 10 20
     """
 
-    what: tyro.conf.Positional[Literal["sim"]]
-    """sim: the simulator."""
+    what: tyro.conf.Positional[Literal["sim", "net"]]
+    """sim: the simulator. net: networks beside skinning and the simulator."""
+    weights: tuple[str, ...] = ("local",)
+    """net: names or folders of weights, or runs."""
+    data: pathlib.Path | None = None
+    """net: a dataset whose test actions give the errors; times alone without one."""
+    simulator: tuple[Literal["draft", "standard", "fine"], ...] = ()
+    """net: accuracies of the simulator to run as well."""
+    batches: tuple[int, ...] = (1, 32)
+    """net: frames a call."""
+    garments: tuple[int, ...] = (1, 2, 3)
+    """net: how many garments are worn."""
     scenes: tuple[Literal["sheet", "skirt", "shirt"], ...] = ("sheet", "skirt", "shirt")
     """A hanging sheet, a dress on a spin, a shirt on a punch."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None

@@ -107,8 +107,10 @@ def _run(
         return export(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Bench):
         from ._bench import bench
+        from ._bench_net import bench_net
 
-        return bench(command, Console(quiet=True) if command.quiet else console)
+        run = bench if command.what == "sim" else bench_net
+        return run(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Simulate | Effects):
         from ._simulate import price, simulate
 

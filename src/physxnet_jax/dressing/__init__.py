@@ -1,6 +1,13 @@
 """Dressing: the whole way from motion and garments to animated meshes."""
 
 from ._blocks import dress_block as dress_block
+from ._cost import (
+    Cost as Cost,
+    mean_errors as mean_errors,
+    network_costs as network_costs,
+    network_errors as network_errors,
+    other_costs as other_costs,
+)
 from ._dress import (
     METHODS as METHODS,
     DressedClip as DressedClip,

@@ -11,5 +11,6 @@ from ._weights import (
     load_predictor as load_predictor,
     read_card as read_card,
     save_predictor as save_predictor,
+    weights_size as weights_size,
 )
 from ._write import EXTENSIONS as EXTENSIONS, check_output as check_output, write_clip as write_clip

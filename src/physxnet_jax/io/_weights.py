@@ -87,6 +87,11 @@ def read_card(weights: str | pathlib.Path = DEFAULT) -> dict[str, Any]:
     return json.loads((_folder(weights) / _CARD).read_text())
 
 
+def weights_size(weights: str | pathlib.Path = DEFAULT) -> int:
+    """Bytes of a network's tensors on disk."""
+    return (_folder(weights) / _TENSORS).stat().st_size
+
+
 def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
     """A predictor by the name of packaged weights, or from a folder.
 

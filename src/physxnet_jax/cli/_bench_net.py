@@ -1,0 +1,143 @@
+"""`physxnet bench net`: what networks cost and how far they are off, beside the others."""
+
+import dataclasses
+import json
+import math
+import pathlib
+from collections.abc import Iterator
+from typing import Any
+
+from rich.console import Console
+
+from ..data import Sequence, list_sequences, read_sequence
+from ..dressing import Cost, mean_errors, network_costs, network_errors, other_costs
+from ..errors import FormatError
+from ..evaluation import Simulator, skinning
+from ..files import whole_file
+from ..garment import TEMPLATES
+from ..io import load_predictor
+from ..motion import load_motion
+from ..viewer import draw_work_precision
+from ._commands import Bench
+from ._machine import machine
+from ._progress import progress_bars
+
+
+def bench_net(command: Bench, console: Console) -> int:
+    """Measures method by method; the rows of each are kept as soon as they are there."""
+    if command.out is not None and command.out.suffix != ".json":
+        raise FormatError(f"{command.out}: rows are written as .json.")
+    tests: list[Sequence] = []
+    if command.data is not None:
+        tests = [read_sequence(f) for f in list_sequences(command.data, "test")]
+        if not tests:
+            raise FormatError(f"{command.data}: no 'test' actions; build a dataset first.")
+    rows: list[Cost] = []
+    if command.out is not None and command.out.is_file():
+        rows = [_from_json(r) for r in json.loads(command.out.read_text())["rows"]]
+    jobs = [("lbs", "-"), *(("simulator", s) for s in command.simulator)]
+    jobs += [("network", w) for w in command.weights]
+    with progress_bars(console) as progress:
+        for k, (kind, size) in enumerate(jobs):
+            progress("methods", k, len(jobs))
+            if any(r.method == kind and r.size == pathlib.Path(size).name for r in rows):
+                continue
+            rows += list(_measure(kind, size, command, tests))
+            if command.out is not None:
+                data = [_to_json(r) for r in rows]
+                with whole_file(command.out) as part:
+                    part.write_text(
+                        json.dumps({"machine": machine(), "rows": data}, indent=1) + "\n"
+                    )
+        progress("methods", len(jobs), len(jobs))
+    text = markdown(rows)
+    console.print(text, markup=False, highlight=False, soft_wrap=True)
+    if command.out is not None:
+        with whole_file(command.out.with_suffix(".md")) as part:
+            part.write_text(text)
+        draw_work_precision(
+            command.out.with_suffix(".png"),
+            [
+                (
+                    f"{r.garments} garments, batch {r.batch}",
+                    f"{r.method} {r.size}",
+                    r.rmse_mm,
+                    r.ms_per_frame,
+                )
+                for r in rows
+                if not math.isnan(r.rmse_mm)
+            ],
+            {},
+        )
+        console.print(f"wrote {command.out}, .md and .png", highlight=False)
+    return 0
+
+
+def _measure(kind: str, size: str, command: Bench, tests: list[Sequence]) -> Iterator[Cost]:
+    walk = load_motion("walk", fps=30.0)
+    if kind != "network":
+        method = skinning() if kind == "lbs" else Simulator(size)
+        yield from other_costs(kind, size, method, walk, mean_errors(method, tests, TEMPLATES))
+        return
+    run = pathlib.Path(size) / "weights"
+    source = run if run.is_dir() else size
+    predictor = load_predictor(source)
+    errors = network_errors(predictor, tests)
+    for row in network_costs(
+        source, predictor, walk, errors, batches=command.batches, garments=command.garments
+    ):
+        yield dataclasses.replace(row, size=pathlib.Path(size).name)
+
+
+def _to_json(row: Cost) -> dict[str, Any]:
+    return {
+        k: (None if math.isnan(v) else float(f"{v:.5g}")) if isinstance(v, float) else v
+        for k, v in dataclasses.asdict(row).items()
+    }
+
+
+def _from_json(row: dict[str, Any]) -> Cost:
+    values: dict[str, Any] = {k: math.nan if v is None else v for k, v in row.items()}
+    return Cost(**values)
+
+
+_COLUMNS = (
+    "method",
+    "size",
+    "garments",
+    "batch",
+    "RMSE mm",
+    "ms a frame",
+    "network ms",
+    "cold s",
+    "parameters",
+    "MFLOP a frame",
+    "weights MB",
+    "peak MB",
+)
+
+
+def markdown(rows: list[Cost]) -> str:
+    """One table, a line for each row."""
+    lines = [f"| {' | '.join(_COLUMNS)} |", "|" + "---|" * len(_COLUMNS)]
+    for r in rows:
+        cells = (
+            r.method,
+            r.size,
+            str(r.garments),
+            str(r.batch),
+            _number(r.rmse_mm, ".1f"),
+            f"{r.ms_per_frame:.2f}",
+            f"{r.ms_network:.2f}" if r.ms_network else "",
+            _number(r.cold_s, ".1f"),
+            f"{r.params:,}" if r.params else "",
+            _number(r.flops / 1e6 / r.batch, ".0f"),
+            f"{r.weights_mb:.1f}" if r.weights_mb else "",
+            _number(r.peak_mb, ".0f"),
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float, how: str) -> str:
+    return "" if math.isnan(value) else format(value, how)

@@ -1,0 +1,251 @@
+"""What a network costs, measured: time, compilation, memory, arithmetic and error."""
+
+import dataclasses
+import pathlib
+import statistics
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence as Items
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..data import Sequence
+from ..evaluation import Method, network, skinning, vertex_error
+from ..garment import Template
+from ..io import weights_size
+from ..models import Predictor, fold_batch_norm
+from ..motion import BLOCK, Motion
+from ..training import usable_garment
+from ._dresser import Dresser, clothe, clothe_frame, make_dresser, start_clothing
+from ._method import pushed_network
+
+# Measured for this long at most, and this often at least.
+_SECONDS, _TIMES = 2.0, 10
+
+
+@dataclasses.dataclass(frozen=True)
+class Cost:
+    """One way to dress: what it costs and how far it is off.
+
+    Attributes:
+        method: ``lbs``, ``network``, ``network+push`` or ``simulator``.
+        size: Name of the weights or the simulator's accuracy.
+        device: What it ran on.
+        batch: Frames a call; 1 is live, a frame in and a frame out.
+        garments: Garments worn, in the order top, bottom, dress.
+        rmse_mm: Mean over the test actions and these garments [mm]; NaN without data.
+        ms_per_frame: From joint rotations to vertices, median of warm calls [ms].
+        ms_network: Of it, the network from features to maps [ms]; 0 without one.
+        cold_s: The first call, compilation included [s].
+        params: Numbers the network has learned.
+        flops: Of a call, over its frames, as the compiler counts them.
+        weights_mb: Size of the weights' file [MB].
+        peak_mb: Memory of a call: arguments, results and what is between [MB].
+    """
+
+    method: str
+    size: str
+    device: str
+    batch: int
+    garments: int
+    rmse_mm: float
+    ms_per_frame: float
+    ms_network: float
+    cold_s: float
+    params: int
+    flops: float
+    weights_mb: float
+    peak_mb: float
+
+
+def network_costs(
+    weights: str | pathlib.Path,
+    predictor: Predictor,
+    motion: Motion,
+    errors: Mapping[str, Mapping[Template, float]],
+    *,
+    batches: Items[int] = (1, 32),
+    garments: Items[int] = (1, 2, 3),
+) -> Iterator[Cost]:
+    """Costs of a network, without and with push-out.
+
+    Args:
+        weights: Its name or folder.
+        predictor: The network.
+        motion: What the person does; repeated where it is shorter than a batch.
+        errors: For ``network`` and ``network+push``, the mean error by template [mm].
+        batches: Frames a call.
+        garments: How many garments are worn.
+
+    Yields:
+        A row for each way, batch and number of garments.
+    """
+    size = pathlib.Path(weights).name
+    params = sum(x.size for x in jax.tree.leaves(predictor.state))
+    worn: tuple[Template, ...] = ("top", "bottom", "dress")
+    for resolve in (False, True):
+        method = "network+push" if resolve else "network"
+        for number in garments:
+            dresser = make_dresser(worn[:number], weights=predictor, resolve=resolve)
+            known = [errors.get(method, {}).get(t, float("nan")) for t in worn[:number]]
+            for batch in batches:
+                yield Cost(
+                    method,
+                    size,
+                    jax.devices()[0].device_kind,
+                    batch,
+                    number,
+                    statistics.fmean(known),
+                    **_clothing(dresser, motion, batch),
+                    ms_network=_network(dresser, batch),
+                    params=params,
+                    weights_mb=weights_size(weights) / 1e6,
+                )
+
+
+def other_costs(
+    kind: str,
+    size: str,
+    method: Method,
+    motion: Motion,
+    errors: Mapping[Template, float],
+) -> Iterator[Cost]:
+    """Costs of a method that dresses one garment at a time: their sums.
+
+    Args:
+        kind: ``lbs`` or ``simulator``.
+        size: Its setting.
+        method: How it is asked.
+        motion: What the person does.
+        errors: Mean error by template [mm].
+
+    Yields:
+        A row for each number of garments.
+    """
+    worn: tuple[Template, ...] = ("top", "bottom", "dress")
+    nan = float("nan")
+    times, colds = [], []
+    for t in worn:
+        began = time.perf_counter()
+        times.append(method(motion, t).ms_per_frame)
+        colds.append(time.perf_counter() - began)
+        known = [errors.get(x, nan) for x in worn[: len(times)]]
+        yield Cost(
+            kind,
+            size,
+            jax.devices()[0].device_kind,
+            BLOCK if kind == "lbs" else 1,
+            len(times),
+            statistics.fmean(known),
+            sum(times),
+            0.0,
+            sum(colds),
+            0,
+            nan,
+            0.0,
+            nan,
+        )
+
+
+def mean_errors(
+    method: Method,
+    sequences: Items[Sequence],
+    templates: Items[Template],
+    *,
+    report: Callable[[], None] | None = None,
+) -> dict[Template, float]:
+    """Mean over actions of the root mean square error over vertices [mm], by template."""
+    out: dict[Template, float] = {}
+    for t in templates:
+        found = []
+        for s in sequences:
+            if t not in s.offsets or not usable_garment(s.meta[t]):
+                continue
+            reference = skinning()(s.motion, t).positions + s.offsets[t]
+            found.append(vertex_error(method(s.motion, t).positions, reference).rmse_mm)
+            if report is not None:
+                report()
+        if found:
+            out[t] = statistics.fmean(found)
+    return out
+
+
+def network_errors(
+    predictor: Predictor, sequences: Items[Sequence], report: Callable[[], None] | None = None
+) -> dict[str, dict[Template, float]]:
+    """`mean_errors` of a network without and with push-out."""
+    templates: tuple[Template, ...] = ("top", "bottom", "dress")
+    return {
+        "network": mean_errors(network(predictor), sequences, templates, report=report),
+        "network+push": mean_errors(pushed_network(predictor), sequences, templates, report=report),
+    }
+
+
+def _clothing(dresser: Dresser, motion: Motion, batch: int) -> dict[str, float]:
+    pick = np.arange(batch) % motion.num_frames
+    q, p = motion.rotations[pick], motion.root[pick]
+    began = time.perf_counter()
+    if batch == 1:
+        stream = start_clothing(dresser, q[0], p[0])
+        live = jax.jit(clothe_frame, static_argnames="fps")
+        program = live.lower(dresser, stream, q[0], p[0], fps=motion.fps).compile()
+
+        def call() -> Any:
+            return program(dresser, stream, q[0], p[0])
+    else:
+        whole = jax.jit(clothe, static_argnames="fps")
+        program = whole.lower(dresser, q, p, fps=motion.fps).compile()
+
+        def call() -> Any:
+            return program(dresser, q, p)
+
+    jax.block_until_ready(call())
+    cold = time.perf_counter() - began
+    return {
+        "ms_per_frame": _median(call) / batch,
+        "cold_s": cold,
+        "flops": _flops(program),
+        "peak_mb": _peak(program) / 1e6,
+    }
+
+
+def _network(dresser: Dresser, batch: int) -> float:
+    predictor = fold_batch_norm(dresser.predictor)
+    templates = tuple(dict.fromkeys(w.template for w in dresser.wearables))
+    features = jnp.zeros(
+        (batch, predictor.surface.rest.shape[0], predictor.config.inputs.channels), jnp.float32
+    )
+    run = jax.jit(lambda n, x: n.from_features(x, templates))
+    return _median(lambda: run(predictor, features)) / batch
+
+
+def _median(call: Callable[[], Any]) -> float:
+    jax.block_until_ready(call())
+    laps: list[float] = []
+    began = time.perf_counter()
+    while len(laps) < _TIMES or time.perf_counter() - began < _SECONDS:
+        start = time.perf_counter()
+        jax.block_until_ready(call())
+        laps.append(1e3 * (time.perf_counter() - start))
+        if time.perf_counter() - began > 5 * _SECONDS:
+            break
+    return statistics.median(laps)
+
+
+def _flops(program: Any) -> float:
+    counted: Any = program.cost_analysis()
+    # A list on some versions and devices.
+    if isinstance(counted, list | tuple):
+        counted = counted[0] if counted else None
+    return float((counted or {}).get("flops", float("nan")))
+
+
+def _peak(program: Any) -> float:
+    memory = program.memory_analysis()
+    if memory is None:
+        return float("nan")
+    return float(
+        memory.argument_size_in_bytes + memory.output_size_in_bytes + memory.temp_size_in_bytes
+    )

@@ -1,0 +1,88 @@
+"""The table of networks: whole rows, nothing measured twice, times that belong together."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+
+from physxnet_jax.body import load_body
+from physxnet_jax.cli import main
+from physxnet_jax.data import Sequence
+from physxnet_jax.dressing import mean_errors
+from physxnet_jax.evaluation import skinning
+from physxnet_jax.garment import TEMPLATES, template
+from physxnet_jax.io import save_predictor
+from physxnet_jax.models import ModelConfig, Normalisation, Predictor, make_generator, make_surface
+from physxnet_jax.motion import Motion, load_motion
+from physxnet_jax.uv import garment_map_rows, make_atlas
+
+
+@pytest.fixture(scope="module")
+def tiny(tmp_path_factory):
+    """A fresh network as small as they come, on disk."""
+    body = load_body()
+    rest = body.rest_vertices(body.default_shape())
+    config = ModelConfig(resolution=32, width=4)
+    atlas = make_atlas(32)
+    valid = {t: garment_map_rows(atlas, body, rest, template(t)).valid for t in TEMPLATES}
+    network = make_generator(config)
+    network.eval()
+    graph, state = nnx.split(network)
+    one = jnp.ones(())
+    scales = Normalisation(one, one, {t: 0.01 * one for t in TEMPLATES})
+    surface = make_surface(atlas, body, rest, valid)
+    folder = tmp_path_factory.mktemp("weights") / "tiny"
+    save_predictor(folder, Predictor(atlas, surface, scales, state, graph, config), name="tiny")
+    return folder
+
+
+def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("physxnet_jax.dressing._cost._SECONDS", 0.05)
+    monkeypatch.setattr("physxnet_jax.dressing._cost._TIMES", 3)
+    out = tmp_path / "net.json"
+    words = ["bench", "net", "--weights", str(tiny), "--batches", "1", "3", "--garments", "1", "2"]
+    assert main([*words, "--out", str(out)]) == 0
+    assert "| network | tiny | 2 | 3 |" in capsys.readouterr().out
+    rows = json.loads(out.read_text())["rows"]
+    mine = [r for r in rows if r["size"] == "tiny"]
+    assert [(r["method"], r["garments"], r["batch"]) for r in mine] == [
+        (m, g, b) for m in ("network", "network+push") for g in (1, 2) for b in (1, 3)
+    ]
+    assert [r["garments"] for r in rows if r["method"] == "lbs"] == [1, 2, 3]
+    for r in mine:
+        assert r["rmse_mm"] is None, "no dataset, no error"
+        assert 0 < r["ms_network"] and 0 < r["ms_per_frame"] < 1e3 * r["cold_s"]
+        assert r["flops"] > 1e6 and r["peak_mb"] > 1 and r["weights_mb"] < 0.2
+    assert mine[0]["params"] == mine[-1]["params"] > 1000
+    # A second garment has a decoder of its own to compute: counted, not timed.
+    assert mine[2]["flops"] > 1.1 * mine[0]["flops"]
+    before = out.read_text()
+    assert main([*words, "--out", str(out), "--quiet"]) == 0
+    assert out.read_text() == before
+    assert (tmp_path / "net.md").is_file() and (tmp_path / "net.png").is_file()
+
+
+def test_mean_errors_are_those_of_the_actions():
+    walk = load_motion("walk", fps=30.0)
+    motion = Motion(walk.rotations[:3], walk.root[:3], 30.0)
+    shift = np.zeros((3, 2726, 3), np.float32)
+    good = {"finite": True, "worst": {"penetration_max": 0.0}}
+    off = [
+        Sequence(str(mm), "test", motion, {"bottom": shift + mm * 1e-3 / 3**0.5}, {"bottom": good})
+        for mm in (3.0, 5.0)
+    ]
+    spoiled = Sequence(
+        "x", "test", motion, {"bottom": shift + 9.0}, {"bottom": {**good, "finite": False}}
+    )
+    found = mean_errors(skinning(), [*off, spoiled], TEMPLATES)
+    assert list(found) == ["bottom"]
+    assert found["bottom"] == pytest.approx(4.0, rel=1e-3)
+
+
+def test_what_is_missing_is_said(tmp_path, capsys):
+    assert main(["bench", "net", "--data", str(tmp_path)]) == 2
+    assert "no 'test' actions" in capsys.readouterr().err
+    assert main(["bench", "net", "--weights", "none", "--out", str(tmp_path / "a.json")]) == 2
+    assert "none" in capsys.readouterr().err
