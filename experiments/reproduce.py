@@ -1,7 +1,8 @@
 """The paper's experiment: every number and figure of docs/reproduction.md.
 
 Command: python experiments/reproduce.py --data runs/ours (and --data runs/blender, if built)
-Cost:    COST
+Cost:    about 40 minutes on two cores for all methods (penetration and the simulator take most
+         of it); goes on where it was stopped.
 Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png;
          datasets.json; the tables between the marks of docs/reproduction.md and README.md,
          with those of ablations.py and unseen.py; and the measured table in the cards of

@@ -1,7 +1,8 @@
 """The `local` network at full size, for one CUDA machine.
 
 Command: physxnet train experiments/configs/local_cuda.py --name local --data runs/ours
-         --data runs/mirror --data runs/slow --out runs/local_cuda
+         --data runs/mirror --data runs/extra --data runs/extra_mirror
+         --splits train extra --out runs/local_cuda
 Cost:    not measured yet, see experiments/gpu_queue.md.
 Result:  what more texels, channels and epochs are worth.
 """
@@ -16,6 +17,7 @@ CONFIG = TrainConfig(
     learning_rate=2e-3,
     schedule="cosine",
     adversarial=False,
+    vertex_share=0.7,
     precision="bfloat16",
     validation=("kick ball",),
     validate_every=1000,
