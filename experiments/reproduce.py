@@ -112,6 +112,8 @@ def note_datasets(folder: pathlib.Path) -> None:
             s for split in ("train", "test", "extra") for s in list_sequences(folder / name, split)
         ]
         sequences = [read_sequence(s) for s in stored]
+        if not any(s.offsets for s in sequences):
+            continue
         digest, size = dataset_digest(folder / name)
         log = read_log(folder / name)
         known[name] = {

@@ -108,7 +108,7 @@ def clothe(
         Vertices [m] by garment's name.
 
     Example:
-        >>> import jax
+        >>> from physxnet_jax.motion import load_motion
         >>> motion = load_motion("walk", fps=30)
         >>> cloth = jax.jit(clothe, static_argnames="fps")(
         ...     make_dresser(["bottom"]), motion.rotations[:2], motion.root[:2], fps=30.0

@@ -66,6 +66,7 @@ def stream_frame(
         The stream for the next frame, and positions of each garment.
 
     Example:
+        >>> import jax
         >>> step = jax.jit(stream_frame, static_argnames="fps", donate_argnames="stream")
     """
     surface, inputs = predictor.surface, predictor.config.inputs
