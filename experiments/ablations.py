@@ -2,8 +2,8 @@
 
 Command: python experiments/ablations.py --data runs/ours --mirror runs/mirror --extra
          runs/extra --slow runs/slow --other runs/blender
-Cost:    about 5 minutes a variant on two cores (128 x 128: 15); goes on where it was
-         stopped. Variants whose dataset isn't built are left out and said so.
+Cost:    5 to 10 minutes a variant on two cores beside other work (larger maps: not run);
+         goes on where it was stopped. Variants whose dataset isn't built are left out and said so.
 Result:  experiments/results/ablations.json and .md: RMSE over vertices of the twelve test
          actions for each template, beside skinning. The seconds of a training step are in
          the JSON alone: a machine that does other things beside makes them incomparable.

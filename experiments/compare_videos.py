@@ -5,7 +5,7 @@ Command: python experiments/compare_videos.py
          --data FOLDER (default: $PHYSXNET_DATA or ../shared), --wear top bottom,
          --ending mp4 (or png, gif), --out experiments/results
 Cost:    about two minutes a motion on two cores, most of it simulation.
-Result:  experiments/results/compare_walk.mp4 and compare_punch.mp4.
+Result:  compare_MOTION.mp4 for each motion; the videos aren't committed.
 """
 
 import argparse

@@ -2,7 +2,7 @@
 
 Command: python experiments/unseen.py
          --data FOLDER (default: $PHYSXNET_DATA or ../shared), --weights local
-Cost:    not run yet; goes on where it was stopped.
+Cost:    about 15 minutes on two cores beside other work; goes on where it was stopped.
 Result:  experiments/results/unseen.json and .md: RMSE of network and skinning to a
          simulation of that very garment or shape, and the share of vertices inside.
 """

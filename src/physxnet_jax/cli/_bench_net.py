@@ -10,9 +10,16 @@ from typing import Any
 from rich.console import Console
 
 from ..data import Sequence, list_sequences, read_sequence
-from ..dressing import Cost, mean_errors, network_costs, network_errors, other_costs
+from ..dressing import (
+    Cost,
+    mean_errors,
+    method_by_name,
+    network_costs,
+    network_errors,
+    other_costs,
+    weights_folder,
+)
 from ..errors import FormatError
-from ..evaluation import Simulator, skinning
 from ..files import whole_file
 from ..garment import TEMPLATES
 from ..io import load_predictor
@@ -76,11 +83,10 @@ def bench_net(command: Bench, console: Console) -> int:
 def _measure(kind: str, size: str, command: Bench, tests: list[Sequence]) -> Iterator[Cost]:
     walk = load_motion("walk", fps=30.0)
     if kind != "network":
-        method = skinning() if kind == "lbs" else Simulator(size)
+        method = method_by_name("lbs" if kind == "lbs" else size)
         yield from other_costs(kind, size, method, walk, mean_errors(method, tests, TEMPLATES))
         return
-    run = pathlib.Path(size) / "weights"
-    source = run if run.is_dir() else size
+    source = weights_folder(size)
     predictor = load_predictor(source)
     errors = network_errors(predictor, tests)
     for row in network_costs(

@@ -304,7 +304,7 @@ class Train:
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write clothes as one function that needs jax alone: joint rotations to vertices.
+    """Write clothes as one function that needs no more than jax and flatbuffers.
 
     Examples:
       physxnet export --wear top bottom --out out/dresser

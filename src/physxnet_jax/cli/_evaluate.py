@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..data import list_sequences, read_sequence
-from ..dressing import pushed_network
+from ..dressing import method_by_name, weights_folder
 from ..errors import FormatError, PhysXNetError
 from ..evaluation import (
     NOISE,
@@ -21,10 +21,8 @@ from ..evaluation import (
     evaluate as measure,
     means,
     nearest_frame,
-    network,
     pose_network,
     retime,
-    skinning,
     summary_table,
     training_frames,
 )
@@ -117,10 +115,6 @@ def _label(name: str) -> str:
 
 
 def _method(name: str, command: Evaluate, progress: Callable[[str, int, int], None]) -> Method:
-    if name == "lbs":
-        return skinning()
-    if name in ACCURACY:
-        return Simulator(name)
     if name == "noise":
         return Simulator("standard", moved=NOISE)
     if name in ("nearest", "mlp"):
@@ -129,15 +123,15 @@ def _method(name: str, command: Evaluate, progress: Callable[[str, int, int], No
             [read_sequence(f) for f in list_sequences(root, "train")], command.templates
         )
         return nearest_frame(known) if name == "nearest" else pose_network(known, report=progress)
-    weights = name.removesuffix("+push")
-    run = pathlib.Path(weights) / "weights"
-    predictor = load_predictor(run if run.is_dir() else weights)
-    missing = set(command.templates) - set(predictor.config.templates)
-    if missing:
-        raise PhysXNetError(
-            f"{name} has no decoder for {', '.join(sorted(missing))}; name --templates it has."
-        )
-    return pushed_network(predictor) if name.endswith("+push") else network(predictor)
+    if name != "lbs" and name not in ACCURACY:
+        # Before minutes are spent on other methods.
+        predictor = load_predictor(weights_folder(name.removesuffix("+push")))
+        missing = set(command.templates) - set(predictor.config.templates)
+        if missing:
+            raise PhysXNetError(
+                f"{name} has no decoder for {', '.join(sorted(missing))}; name --templates it has."
+            )
+    return method_by_name(name)
 
 
 def _summary(rows: list[ActionError], engine: str) -> Table:

@@ -33,7 +33,11 @@ from ._ladder import (
     pick_rung as pick_rung,
 )
 from ._meshes import animated_meshes as animated_meshes
-from ._method import pushed_network as pushed_network
+from ._method import (
+    method_by_name as method_by_name,
+    pushed_network as pushed_network,
+    weights_folder as weights_folder,
+)
 from ._push_out import (
     SkinPatch as SkinPatch,
     make_patch as make_patch,

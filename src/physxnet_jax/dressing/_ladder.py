@@ -12,13 +12,13 @@ from typing import Any
 import jax
 
 from ..errors import PhysXNetError
-from ..evaluation import Method as Measured, Simulator, network, skinning
+from ..evaluation import Method as Measured
 from ..files import whole_file
 from ..garment import TEMPLATES, Template
-from ..io import load_predictor, read_card
+from ..io import read_card
 from ..motion import Motion, load_motion
 from ..simulation import ACCURACY
-from ._method import pushed_network
+from ._method import method_by_name
 
 _FRAMES = 64
 
@@ -121,7 +121,7 @@ def calibrate(
         if name in known:
             continue
         if rung.name not in methods:
-            methods = {rung.name: _method(rung.name)}
+            methods = {rung.name: method_by_name(rung.name)}
         known[name] = methods[rung.name](walk, name).ms_per_frame
         with whole_file(path) as part:
             part.write_text(json.dumps({"machine": here, "times": times}, indent=1) + "\n")
@@ -193,15 +193,6 @@ def pick_rung(
         finer = min(better, key=cost)
         told += f"; {finer.name} would take {cost(finer):.2f} ms for {error(finer):.1f} mm"
     return Choice(best, cost(best), error(best), told)
-
-
-def _method(name: str) -> Measured:
-    if name == "lbs":
-        return skinning()
-    if name in ACCURACY:
-        return Simulator(name)
-    predictor = load_predictor(name.removesuffix("+push"))
-    return pushed_network(predictor) if name.endswith("+push") else network(predictor)
 
 
 def _machine() -> dict[str, Any]:

@@ -1,14 +1,17 @@
 """The network with push-out, as evaluation asks for methods."""
 
 import functools
+import pathlib
 
 import jax
 from jaxtyping import Array
 
 from ..body import load_body
-from ..evaluation import Blockwise, network
+from ..evaluation import Blockwise, Method, Simulator, network, skinning
 from ..garment import Template, template
+from ..io import load_predictor
 from ..models import Predictor, Wearable, dress_frames
+from ..simulation import ACCURACY
 from ._push_out import SkinPatch, make_patch, push_out
 
 _Worn = tuple[Predictor, Wearable, SkinPatch]
@@ -26,6 +29,30 @@ def pushed_network(predictor: Predictor) -> Blockwise:
         return predictor, worn, make_patch(body, rest, worn, template(name).mesh)
 
     return Blockwise(_block, wear, plain.lead)
+
+
+def method_by_name(name: str) -> Method:
+    """A way to dress by its name: ``lbs``, an accuracy of the simulator, a network's.
+
+    Args:
+        name: A network is called by its weights' name or folder, or a run's folder; with
+            ``+push`` behind it its vertices are pushed out of the body.
+
+    Raises:
+        WeightsError: There are no such weights.
+    """
+    if name == "lbs":
+        return skinning()
+    if name in ACCURACY:
+        return Simulator(name)
+    predictor = load_predictor(weights_folder(name.removesuffix("+push")))
+    return pushed_network(predictor) if name.endswith("+push") else network(predictor)
+
+
+def weights_folder(name: str) -> str | pathlib.Path:
+    """Where a run keeps its weights; any other name as it is."""
+    run = pathlib.Path(name) / "weights"
+    return run if run.is_dir() else name
 
 
 @functools.partial(jax.jit, static_argnames=("fps",))
