@@ -4,10 +4,11 @@ Command: python experiments/reproduce.py --data runs/ours (and --data runs/blend
 Cost:    about 40 minutes on two cores for all methods (penetration and the simulator take most
          of it); goes on where it was stopped.
 Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png;
-         datasets.json; the tables between the marks of docs/reproduction.md and README.md,
-         with those of ablations.py and unseen.py; and the measured table in the cards of
-         the packaged weights. Datasets are built by `physxnet dataset build`, weights
-         trained by `physxnet train`, both from experiments/configs.
+         datasets.json; the tables between the marks of docs/reproduction.md,
+         docs/accuracy-cost.md and README.md, with those of ablations.py, unseen.py,
+         bench_peers.py and `physxnet bench net`; and the measured table in the cards of the
+         packaged weights. Datasets are built by `physxnet dataset build`, weights trained by
+         `physxnet train`, both from experiments/configs.
 """
 
 import argparse
@@ -32,18 +33,22 @@ METHODS = (
     "nearest",
     "mlp",
     "runs/local-22",
+    "nano",
+    "small",
+    "small+push",
     "local",
     "local+push",
     "paper",
     "draft",
     "noise",
 )
-NETWORKS = ("local-22", "local", "paper")
+NETWORKS = ("local-22", "nano", "small", "local", "paper")
 SETS = {
     "ours": "protocol",
     "mirror": "mirrored training actions",
     "extra": "extra actions",
     "extra_mirror": "mirrored extra actions",
+    "mixed": "legs of training actions with upper bodies of others, wider",
     "slow": "training actions at 0.8 of their speed",
     "blender": "protocol, Blender",
 }
@@ -66,11 +71,12 @@ def main() -> None:
     note_datasets(pathlib.Path(words.learn_from).parent)
     blocks = {"summary": summary_table(rows), "errors": error_tables(rows), "claims": claims(rows)}
     blocks["datasets"] = dataset_table()
-    for name in ("ablations", "unseen"):
+    for name in ("ablations", "unseen", "accuracy_cost", "peers"):
         path = RESULTS / f"{name}.md"
         if path.is_file():
             blocks[name] = path.read_text()
-    for path in (ROOT / "docs/reproduction.md", ROOT / "README.md"):
+    documents = ("docs/reproduction.md", "docs/accuracy-cost.md", "README.md")
+    for path in (ROOT / name for name in documents if (ROOT / name).is_file()):
         text = path.read_text()
         for name, block in blocks.items():
             mark = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.S)
@@ -85,7 +91,9 @@ def main() -> None:
 def write_ladder(rows: list[ActionError]) -> None:
     """The errors by which `physxnet dress --budget-ms` chooses."""
     # The teacher itself is as far from itself as two of its runs part.
-    names = {n: n for n in ("lbs", "local", "local+push", "draft")} | {"noise": "standard"}
+    names = {n: n for n in ("lbs", "small", "small+push", "local", "local+push", "draft")} | {
+        "noise": "standard"
+    }
     rungs = []
     for method, name in names.items():
         found = {t: m for t in TEMPLATES if (m := means(rows, method, t, "physxnet"))}

@@ -8,8 +8,16 @@
 
 import sys as _sys
 
-from ._environment import check_jaxlib as _check_jaxlib
+from ._environment import (
+    check_jaxlib as _check_jaxlib,
+    keep_programs as _keep_programs,
+    keeps_programs as _keeps_programs,
+)
 from ._version import __version__ as __version__
+
+# A command is a process of its own; a program that imports this package decides for itself.
+if _keeps_programs(_sys.argv):
+    _keep_programs()
 
 # `physxnet doctor` must be able to say what is wrong.
 if _sys.argv[1:2] != ["doctor"]:

@@ -1,7 +1,11 @@
-"""What is installed, and whether it can be trusted with numbers."""
+"""What is installed, whether it can be trusted with numbers, and where programs are kept."""
 
+import hashlib
 import importlib.metadata
 import os
+import pathlib
+import platform
+from collections.abc import MutableMapping, Sequence
 
 from .errors import BrokenInstallError
 
@@ -37,3 +41,46 @@ def check_jaxlib() -> None:
     problem = jaxlib_problem(importlib.metadata.version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
     if problem is not None:
         raise BrokenInstallError(problem)
+
+
+def cache_folder() -> pathlib.Path:
+    """Where this machine's times and programs are kept: $XDG_CACHE_HOME or ~/.cache."""
+    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+    return pathlib.Path(home) / "physxnet_jax"
+
+
+def keeps_programs(words: Sequence[str]) -> bool:
+    """Whether a process of these words is a command that should keep its programs.
+
+    Commands that measure compilation must compile.
+    """
+    return pathlib.PurePath(words[0]).stem == "physxnet" and words[1:2] not in (
+        ["bench"],
+        ["effects"],
+    )
+
+
+def keep_programs(environment: MutableMapping[str, str] | None = None) -> None:
+    """Lets JAX keep compiled programs for the next process; before jax is imported.
+
+    What is already set stays as it is. Each kind of processor has its own folder: a
+    home may be shared by machines of which one can't run what another has compiled.
+
+    Args:
+        environment: Variables to set; the process's own by default.
+    """
+    env = os.environ if environment is None else environment
+    machine = f"{platform.machine()}-{hashlib.sha256(_processor().encode()).hexdigest()[:8]}"
+    env.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "programs" / machine))
+    env.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+    # Loading from the cache, XLA takes its own hints for missing instructions and says so
+    # as an error (jax-ml/jax#38445).
+    env.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def _processor() -> str:
+    try:
+        lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor()
+    return next((x for x in lines if x.startswith(("flags", "Features"))), platform.processor())

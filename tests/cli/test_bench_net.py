@@ -43,6 +43,7 @@ def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("physxnet_jax.dressing._cost._TIMES", 3)
     out = tmp_path / "net.json"
     words = ["bench", "net", "--weights", str(tiny), "--batches", "1", "3", "--garments", "1", "2"]
+    words += ["--backward"]
     assert main([*words, "--out", str(out)]) == 0
     assert "| network | tiny | 2 | 3 |" in capsys.readouterr().out
     rows = json.loads(out.read_text())["rows"]
@@ -54,6 +55,7 @@ def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys, monkeypatch):
     for r in mine:
         assert r["rmse_mm"] is None, "no dataset, no error"
         assert 0 < r["ms_network"] and 0 < r["ms_per_frame"] < 1e3 * r["cold_s"]
+        assert r["ms_backward"] > r["ms_per_frame"] and r["backward_mb"] > 1
         assert r["flops"] > 1e6 and r["peak_mb"] > 1 and r["weights_mb"] < 0.2
     assert mine[0]["params"] == mine[-1]["params"] > 1000
     # A second garment has a decoder of its own to compute: counted, not timed.

@@ -3,10 +3,12 @@
 import functools
 import zlib
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from physxnet_jax.body import load_body
 from physxnet_jax.data import (
     DatasetConfig,
     build_dataset,
@@ -19,6 +21,7 @@ from physxnet_jax.data import (
     write_garment,
     write_offsets,
 )
+from physxnet_jax.data._build import action_motion
 from physxnet_jax.errors import FormatError, MotionError
 from physxnet_jax.garment import square_sheet
 from physxnet_jax.motion import load_motion
@@ -118,6 +121,24 @@ def test_a_build_goes_on_where_it_was_and_is_another_with_another_solver(data_di
     assert dataset_digest(tmp_path)[0] == before, "same configuration, same bytes"
     with pytest.raises(FormatError, match="another configuration"):
         build(DatasetConfig(templates=("bottom",), solver=XPBD(16, 1)))
+
+
+def test_actions_are_changed_as_the_configuration_says(data_dir):
+    body = load_body()
+    train = [a for a in read_protocol(data_dir / "mocap") if a.split == "train"]
+    last, first = train[-1], train[0]
+    load = functools.partial(action_motion, body=body, folder=data_dir / "mocap")
+    plain, other = load(DatasetConfig(), last), load(DatasetConfig(), first)
+    arm, leg = body.joint("LeftArm"), body.joint("LeftUpLeg")
+    # One place further on from the last action is the first one.
+    mixed = load(DatasetConfig(upper_from=1), last)
+    np.testing.assert_allclose(mixed.rotations[:5, arm], other.rotations[:5, arm], atol=1e-6)
+    np.testing.assert_allclose(mixed.rotations[:, leg], plain.rotations[:, leg], atol=1e-6)
+    wide = load(DatasetConfig(exaggerate=1.3), last)
+    assert np.abs(np.asarray(wide.rotations - plain.rotations)).max() > 0.01
+    both = load(DatasetConfig(mirror=True, speed=2.0), last)
+    assert both.num_frames == (plain.num_frames + 1) // 2
+    np.testing.assert_allclose(both.root[0] * jnp.array([-1.0, 1.0, 1.0]), plain.root[0], atol=1e-5)
 
 
 def test_unknown_actions_are_named_before_anything_is_built(data_dir, tmp_path):

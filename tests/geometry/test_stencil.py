@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physxnet_jax.geometry import Stencil, gaussian_stencil, spread_points
+from physxnet_jax.geometry import Stencil, gaussian_smoothing, gaussian_stencil, spread_points
 
 
 def sheet(n, step=0.01):
@@ -47,6 +47,29 @@ def test_lonely_vertices_keep_their_value_and_coincident_ones_share_it():
     out = np.asarray(s @ jnp.asarray([[0.0], [3.0], [6.0], [9.0]]))
     np.testing.assert_allclose(out.ravel(), [3.0, 3.0, 3.0, 9.0], atol=1e-5)
     assert isinstance(s, Stencil)
+
+
+@pytest.mark.parametrize("step", [0.02, 0.01, 0.004])
+def test_smoothing_leaves_no_lumps_however_fine_the_mesh(step):
+    v, f = sheet(24, step)
+    smoothing = gaussian_smoothing(v, f, 0.03)
+    assert len(smoothing.stencils) <= 5
+    np.testing.assert_allclose(np.asarray(smoothing @ jnp.ones((len(v), 1))), 1.0, atol=1e-6)
+    noise = jnp.asarray(np.random.default_rng(0).normal(size=(len(v), 1)).astype(np.float32))
+
+    def lumps(values):
+        """Second differences along rows, over what is left of the noise."""
+        rows = np.asarray(values).reshape(24, 24)
+        return np.abs(np.diff(rows, 2, axis=1)).mean() / rows.std()
+
+    alone = gaussian_stencil(v, f, 0.03)
+    assert lumps(smoothing @ noise) < 0.6 * lumps(alone @ (alone @ noise))
+
+
+def test_smoothing_no_wider_than_the_mesh_is_one_stencil():
+    v, f = sheet(12, 0.02)
+    (only,) = gaussian_smoothing(v, f, 0.015).stencils
+    np.testing.assert_array_equal(only.index, gaussian_stencil(v, f, 0.015).index)
 
 
 @pytest.mark.parametrize("spacing", [0.05, 0.3])

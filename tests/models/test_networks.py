@@ -15,6 +15,7 @@ from physxnet_jax.models import (
     ModelConfig,
     Normalisation,
     Predictor,
+    at_precision,
     clip_features,
     depth_to_space,
     dress_frames,
@@ -351,6 +352,24 @@ def test_folded_networks_answer_as_before(worn):
     again = fold_batch_norm(folded)
     for one, two in zip(jax.tree.leaves(folded.state), jax.tree.leaves(again.state), strict=True):
         np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
+
+
+def test_fewer_bits_change_little_and_more_bits_next_to_nothing(worn):
+    """bfloat16 has 8 bits: half a per cent a number, averaged over the taps of a kernel."""
+    atlas, surface, _ = worn
+    predictor = trained_like(surface, atlas, LOCAL)
+    x = jax.random.normal(jax.random.key(3), (2, surface.rest.shape[0], LOCAL.channels))
+    want = predictor.from_features(x, ("top",))["top"]
+    scale = float(jnp.sqrt(jnp.mean(want * want)))
+    low = at_precision(predictor, "bfloat16").from_features(x, ("top",))["top"]
+    assert low.dtype == jnp.float32
+    off = float(jnp.sqrt(jnp.mean((low - want) ** 2)))
+    assert 1e-4 * scale < off < 0.02 * scale
+    with jax.enable_x64(True):
+        high = at_precision(predictor, "float64").from_features(x, ("top",))["top"]
+        # Were it float32 in disguise, both would agree to the last bit.
+        gap = np.abs(np.asarray(high) - np.asarray(want)).max()
+    assert 0.0 < gap < 2e-5 * scale
 
 
 @pytest.mark.parametrize("inputs", [LOCAL, PAPER_FAR], ids=["local", "far"])

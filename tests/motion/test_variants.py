@@ -6,15 +6,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import KDTree
+from scipy.spatial.transform import Rotation
 
 from physxnet_jax.body import NUM_BODY_VERTICES, load_body
 from physxnet_jax.errors import MotionError
 from physxnet_jax.motion import (
     at_speed,
     body_animation,
+    exaggerated,
     load_motion,
     mirror_joints,
     mirrored,
+    with_upper_body,
 )
 
 
@@ -66,3 +69,60 @@ def test_twice_as_fast_is_every_second_frame():
     with pytest.raises(MotionError, match="positive"):
         at_speed(motion, 0.0)
     assert jnp.isfinite(slow.rotations).all()
+
+
+def angles(motion, joint):
+    """Angle of a joint from its mean rotation, frame by frame [rad]."""
+    turns = Rotation.from_quat(np.roll(np.asarray(motion.rotations[:, joint]), -1, axis=1))
+    return (turns.mean().inv() * turns).magnitude()
+
+
+@pytest.mark.parametrize("factor", [0.5, 1.25])
+def test_exaggeration_turns_joints_that_much_further_from_their_mean(factor):
+    motion = load_motion("walk", fps=30.0)
+    wide = exaggerated(motion, factor)
+    for name in ("LeftUpLeg", "RightForeArm"):
+        joint = load_body().joint_names.index(name)
+        np.testing.assert_allclose(
+            angles(wide, joint), factor * angles(motion, joint), rtol=0.05, atol=0.01
+        )
+    np.testing.assert_array_equal(wide.root, motion.root)
+    np.testing.assert_array_equal(wide.rotations[:, 0], motion.rotations[:, 0])
+
+
+def test_no_exaggeration_is_the_motion_and_a_huge_one_is_bounded():
+    motion = load_motion("punch", fps=30.0)
+    same = exaggerated(motion, 1.0)
+    dots = np.abs(np.sum(np.asarray(same.rotations) * np.asarray(motion.rotations), axis=2))
+    np.testing.assert_allclose(dots, 1.0, atol=1e-5)
+    huge = exaggerated(motion, 50.0)
+    assert np.isfinite(np.asarray(huge.rotations)).all()
+    joint = load_body().joint_names.index("RightArm")
+    original = Rotation.from_quat(np.roll(np.asarray(motion.rotations[:, joint]), -1, axis=1))
+    turned = Rotation.from_quat(np.roll(np.asarray(huge.rotations[:, joint]), -1, axis=1))
+    assert (original.mean().inv() * turned).magnitude().max() < 2.61
+    with pytest.raises(MotionError, match="positive"):
+        exaggerated(motion, -1.0)
+
+
+def test_another_upper_body_leaves_the_legs_and_plays_to_and_fro():
+    body = load_body()
+    walk, punch = load_motion("walk", fps=30.0), load_motion("punch", fps=30.0)
+    short = dataclasses.replace(punch, rotations=punch.rotations[:4], root=punch.root[:4])
+    mixed = with_upper_body(body, walk, short)
+    assert mixed.num_frames == walk.num_frames
+    np.testing.assert_array_equal(mixed.root, walk.root)
+    names = list(body.joint_names)
+    legs = [names.index(n) for n in ("Hips", "LHipJoint", "LeftUpLeg", "RightFoot")]
+    arms = [names.index(n) for n in ("LowerBack", "Head", "LeftHand", "RightArm")]
+    np.testing.assert_allclose(mixed.rotations[:, legs], walk.rotations[:, legs], atol=1e-6)
+    order = [0, 1, 2, 3, 2, 1, 0, 1]
+    np.testing.assert_allclose(
+        mixed.rotations[:8][:, arms], np.asarray(punch.rotations)[order][:, arms], atol=1e-6
+    )
+    slower = dataclasses.replace(punch, fps=25.0)
+    with pytest.raises(MotionError, match="resample"):
+        with_upper_body(body, walk, slower)
+    still = dataclasses.replace(body, joint_names=tuple(f"J{k}" for k in range(len(names))))
+    with pytest.raises(MotionError, match="no spine"):
+        with_upper_body(still, walk, punch)

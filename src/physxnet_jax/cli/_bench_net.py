@@ -12,6 +12,7 @@ from rich.console import Console
 from ..data import Sequence, list_sequences, read_sequence
 from ..dressing import (
     Cost,
+    Precision,
     mean_errors,
     method_by_name,
     network_costs,
@@ -23,6 +24,7 @@ from ..errors import FormatError
 from ..files import whole_file
 from ..garment import TEMPLATES
 from ..io import load_predictor
+from ..models import at_precision
 from ..motion import load_motion
 from ..viewer import draw_work_precision
 from ._commands import Bench
@@ -42,14 +44,17 @@ def bench_net(command: Bench, console: Console) -> int:
     rows: list[Cost] = []
     if command.out is not None and command.out.is_file():
         rows = [_from_json(r) for r in json.loads(command.out.read_text())["rows"]]
-    jobs = [("lbs", "-"), *(("simulator", s) for s in command.simulator)]
-    jobs += [("network", w) for w in command.weights]
+    plain: Precision = "float32"
+    jobs: list[tuple[str, str, Precision]] = [("lbs", "-", plain)]
+    jobs.extend(("simulator", s, plain) for s in command.simulator)
+    jobs.extend(("network", w, p) for w in command.weights for p in command.precisions)
     with progress_bars(console) as progress:
-        for k, (kind, size) in enumerate(jobs):
+        for k, (kind, size, precision) in enumerate(jobs):
             progress("methods", k, len(jobs))
-            if any(r.method == kind and r.size == pathlib.Path(size).name for r in rows):
+            name = pathlib.Path(size).name
+            if any((r.method, r.size, r.precision) == (kind, name, precision) for r in rows):
                 continue
-            rows += list(_measure(kind, size, command, tests))
+            rows += list(_measure(kind, size, precision, command, tests))
             if command.out is not None:
                 data = [_to_json(r) for r in rows]
                 with whole_file(command.out) as part:
@@ -67,7 +72,7 @@ def bench_net(command: Bench, console: Console) -> int:
             [
                 (
                     f"{r.garments} garments, batch {r.batch}",
-                    f"{r.method} {r.size}",
+                    f"{r.method} {r.size}" + (" bf16" if r.precision == "bfloat16" else ""),
                     r.rmse_mm,
                     r.ms_per_frame,
                 )
@@ -80,17 +85,25 @@ def bench_net(command: Bench, console: Console) -> int:
     return 0
 
 
-def _measure(kind: str, size: str, command: Bench, tests: list[Sequence]) -> Iterator[Cost]:
+def _measure(
+    kind: str, size: str, precision: Precision, command: Bench, tests: list[Sequence]
+) -> Iterator[Cost]:
     walk = load_motion("walk", fps=30.0)
     if kind != "network":
         method = method_by_name("lbs" if kind == "lbs" else size)
         yield from other_costs(kind, size, method, walk, mean_errors(method, tests, TEMPLATES))
         return
     source = weights_folder(size)
-    predictor = load_predictor(source)
-    errors = network_errors(predictor, tests)
+    predictor = at_precision(load_predictor(source), precision)
     for row in network_costs(
-        source, predictor, walk, errors, batches=command.batches, garments=command.garments
+        source,
+        predictor,
+        walk,
+        network_errors(predictor, tests),
+        batches=command.batches,
+        garments=command.garments,
+        backward=command.backward,
+        precision=precision,
     ):
         yield dataclasses.replace(row, size=pathlib.Path(size).name)
 
@@ -115,11 +128,13 @@ _COLUMNS = (
     "RMSE mm",
     "ms a frame",
     "network ms",
+    "gradient ms",
     "cold s",
     "parameters",
     "MFLOP a frame",
     "weights MB",
     "peak MB",
+    "gradient MB",
 )
 
 
@@ -129,17 +144,19 @@ def markdown(rows: list[Cost]) -> str:
     for r in rows:
         cells = (
             r.method,
-            r.size,
+            r.size if r.precision == "float32" else f"{r.size} {r.precision}",
             str(r.garments),
             str(r.batch),
             _number(r.rmse_mm, ".1f"),
             f"{r.ms_per_frame:.2f}",
             f"{r.ms_network:.2f}" if r.ms_network else "",
+            _number(r.ms_backward, ".1f"),
             _number(r.cold_s, ".1f"),
             f"{r.params:,}" if r.params else "",
             _number(r.flops / 1e6 / r.batch, ".0f"),
             f"{r.weights_mb:.1f}" if r.weights_mb else "",
             _number(r.peak_mb, ".0f"),
+            _number(r.backward_mb, ".0f"),
         )
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"

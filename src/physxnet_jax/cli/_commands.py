@@ -201,7 +201,7 @@ class Bench:
     """What accuracy costs in time: solvers and settings, or networks and their sizes.
 
     Examples:
-      physxnet bench net --weights local paper --data runs/ours --out out/net.json
+      physxnet bench net --weights nano small local --data runs/ours --out out/net.json
       physxnet bench sim --out out/sim_bench.json
       physxnet bench sim --scenes sheet
       physxnet bench sim --blender 5 10 15 20 --shirt shirt.obj --motion punch.bvh
@@ -214,8 +214,12 @@ class Bench:
     """net: names or folders of weights, or runs."""
     data: pathlib.Path | None = None
     """net: a dataset whose test actions give the errors; times alone without one."""
-    simulator: tuple[Literal["draft", "standard", "fine"], ...] = ()
-    """net: accuracies of the simulator to run as well."""
+    simulator: tuple[Literal["draft", "standard", "fine", "noise"], ...] = ()
+    """net: accuracies of the simulator to run as well; noise is standard with jitter."""
+    precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32",)
+    """net: what the networks' arithmetic is done in."""
+    backward: bool = False
+    """net: measure gradients as well."""
     batches: tuple[int, ...] = (1, 32)
     """net: frames a call."""
     garments: tuple[int, ...] = (1, 2, 3)

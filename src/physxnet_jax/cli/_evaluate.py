@@ -13,10 +13,8 @@ from ..data import list_sequences, read_sequence
 from ..dressing import method_by_name, weights_folder
 from ..errors import FormatError, PhysXNetError
 from ..evaluation import (
-    NOISE,
     ActionError,
     Method,
-    Simulator,
     error_tables,
     evaluate as measure,
     means,
@@ -115,15 +113,13 @@ def _label(name: str) -> str:
 
 
 def _method(name: str, command: Evaluate, progress: Callable[[str, int, int], None]) -> Method:
-    if name == "noise":
-        return Simulator("standard", moved=NOISE)
     if name in ("nearest", "mlp"):
         root = command.learn_from or command.data
         known = training_frames(
             [read_sequence(f) for f in list_sequences(root, "train")], command.templates
         )
         return nearest_frame(known) if name == "nearest" else pose_network(known, report=progress)
-    if name != "lbs" and name not in ACCURACY:
+    if name not in ("lbs", "noise", *ACCURACY):
         # Before minutes are spent on other methods.
         predictor = load_predictor(weights_folder(name.removesuffix("+push")))
         missing = set(command.templates) - set(predictor.config.templates)

@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..body import Body
 from ..errors import FormatError
 from ..garment import template
-from ..motion import Motion, animate, at_speed, mirrored
+from ..motion import Motion, animate, at_speed, exaggerated, mirrored, with_upper_body
 from ..simulation import PreparedScene, Scene, prepare_scene, simulate_batch
 from ..simulation.blender import simulate_blender
 from ._config import CARD, DatasetConfig
@@ -100,9 +101,17 @@ def _note(config: DatasetConfig) -> dict[str, Any]:
         "templates": list(config.templates),
         "mirror": config.mirror,
         "speed": config.speed,
+        **_changes(config),
         **config.settings(),
         **CARD,
     }
+
+
+def _changes(config: DatasetConfig) -> dict[str, Any]:
+    """Settings that sets built before there were any don't name."""
+    changes = {"upper_from": config.upper_from, "exaggerate": config.exaggerate}
+    usual = DatasetConfig()
+    return {k: v for k, v in changes.items() if v != getattr(usual, k)}
 
 
 def _simulate(
@@ -113,11 +122,7 @@ def _simulate(
     scene: PreparedScene,
     folder: pathlib.Path,
 ) -> None:
-    motion = load_action(folder, action)
-    if config.mirror:
-        motion = mirrored(scene.assembly.body, motion)
-    if config.speed != 1.0:
-        motion = at_speed(motion, config.speed)
+    motion = action_motion(config, action, scene.assembly.body, folder)
     write_action(target, motion, action.split)
     began = time.perf_counter()
     if config.engine == "blender":
@@ -141,6 +146,25 @@ def _simulate(
     )
     line = {"action": action.name, "template": name, "frames": motion.num_frames}
     log_build(target.parent, line | {"seconds": round(seconds, 2)})
+
+
+def action_motion(
+    config: DatasetConfig, action: Action, body: Body, folder: pathlib.Path
+) -> Motion:
+    """An action as a configuration wants it: of whose arms, how wide, which side, how fast."""
+    motion = load_action(folder, action)
+    if config.upper_from:
+        split = [a for a in read_protocol(folder) if a.split == action.split]
+        place = next(k for k, a in enumerate(split) if a.name == action.name)
+        other = load_action(folder, split[(place + config.upper_from) % len(split)])
+        motion = with_upper_body(body, motion, other)
+    if config.exaggerate != 1.0:
+        motion = exaggerated(motion, config.exaggerate)
+    if config.mirror:
+        motion = mirrored(body, motion)
+    if config.speed != 1.0:
+        motion = at_speed(motion, config.speed)
+    return motion
 
 
 def skinned_cloth(scene: PreparedScene, motion: Motion) -> np.ndarray:

@@ -25,6 +25,9 @@ class DatasetConfig:
         templates: Garments, each simulated by itself.
         mirror: Left and right of every motion are exchanged.
         speed: Every motion is played this many times as fast.
+        upper_from: Spine, arms and head are taken from the action this many places
+            further on in the same split; 0 leaves them.
+        exaggerate: Joints turn this many times as far from their mean rotation.
         solver: Settings of our simulator.
         blender: Settings of Blender's.
     """
@@ -34,6 +37,8 @@ class DatasetConfig:
     templates: tuple[Template, ...] = TEMPLATES
     mirror: bool = False
     speed: float = 1.0
+    upper_from: int = 0
+    exaggerate: float = 1.0
     solver: XPBD = dataclasses.field(default_factory=XPBD)
     blender: BlenderSettings = dataclasses.field(default_factory=BlenderSettings)
 

@@ -18,6 +18,7 @@ from ._dress import (
 )
 from ._dresser import (
     Dresser as Dresser,
+    Precision as Precision,
     clothe as clothe,
     clothe_frame as clothe_frame,
     make_dresser as make_dresser,

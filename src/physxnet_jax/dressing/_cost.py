@@ -1,6 +1,8 @@
 """What a network costs, measured: time, compilation, memory, arithmetic and error."""
 
 import dataclasses
+import functools
+import math
 import pathlib
 import statistics
 import time
@@ -15,10 +17,10 @@ from ..data import Sequence
 from ..evaluation import Method, network, skinning, vertex_error
 from ..garment import Template
 from ..io import weights_size
-from ..models import Predictor, fold_batch_norm
+from ..models import Predictor
 from ..motion import BLOCK, Motion
 from ..training import usable_garment
-from ._dresser import Dresser, clothe, clothe_frame, make_dresser, start_clothing
+from ._dresser import Dresser, Precision, clothe, clothe_frame, make_dresser, start_clothing
 from ._method import pushed_network
 
 # Measured for this long at most, and this often at least.
@@ -38,11 +40,15 @@ class Cost:
         rmse_mm: Mean over the test actions and these garments [mm]; NaN without data.
         ms_per_frame: From joint rotations to vertices, median of warm calls [ms].
         ms_network: Of it, the network from features to maps [ms]; 0 without one.
+        ms_backward: The vertices and the gradient of their squares with respect to
+            rotations, root and the network's parameters, a frame [ms]; NaN if not asked for.
         cold_s: The first call, compilation included [s].
         params: Numbers the network has learned.
         flops: Of a call, over its frames, as the compiler counts them.
         weights_mb: Size of the weights' file [MB].
         peak_mb: Memory of a call: arguments, results and what is between [MB].
+        backward_mb: The same of the gradient.
+        precision: Of the network's arithmetic.
     """
 
     method: str
@@ -58,6 +64,9 @@ class Cost:
     flops: float
     weights_mb: float
     peak_mb: float
+    ms_backward: float = math.nan
+    backward_mb: float = math.nan
+    precision: str = "float32"
 
 
 def network_costs(
@@ -68,6 +77,8 @@ def network_costs(
     *,
     batches: Items[int] = (1, 32),
     garments: Items[int] = (1, 2, 3),
+    backward: bool = False,
+    precision: Precision = "float32",
 ) -> Iterator[Cost]:
     """Costs of a network, without and with push-out.
 
@@ -78,6 +89,8 @@ def network_costs(
         errors: For ``network`` and ``network+push``, the mean error by template [mm].
         batches: Frames a call.
         garments: How many garments are worn.
+        backward: Measure gradients as well.
+        precision: Of the network's arithmetic.
 
     Yields:
         A row for each way, batch and number of garments.
@@ -88,7 +101,9 @@ def network_costs(
     for resolve in (False, True):
         method = "network+push" if resolve else "network"
         for number in garments:
-            dresser = make_dresser(worn[:number], weights=predictor, resolve=resolve)
+            dresser = make_dresser(
+                worn[:number], weights=predictor, resolve=resolve, precision=precision
+            )
             known = [errors.get(method, {}).get(t, float("nan")) for t in worn[:number]]
             for batch in batches:
                 yield Cost(
@@ -99,9 +114,11 @@ def network_costs(
                     number,
                     statistics.fmean(known),
                     **_clothing(dresser, motion, batch),
+                    **(_gradient(dresser, motion, batch) if backward else {}),
                     ms_network=_network(dresser, batch),
                     params=params,
                     weights_mb=weights_size(weights) / 1e6,
+                    precision=precision,
                 )
 
 
@@ -211,8 +228,28 @@ def _clothing(dresser: Dresser, motion: Motion, batch: int) -> dict[str, float]:
     }
 
 
+def _gradient(dresser: Dresser, motion: Motion, batch: int) -> dict[str, float]:
+    """Of the clip form, however many frames there are."""
+    pick = np.arange(batch) % motion.num_frames
+    q, p = motion.rotations[pick], motion.root[pick]
+
+    def total(state: Any, q: jax.Array, p: jax.Array) -> jax.Array:
+        worn = dataclasses.replace(
+            dresser, predictor=dataclasses.replace(dresser.predictor, state=state)
+        )
+        squares = [jnp.sum(x * x) for x in clothe(worn, q, p, motion.fps).values()]
+        return functools.reduce(jnp.add, squares)
+
+    backward = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2)))
+    program = backward.lower(dresser.predictor.state, q, p).compile()
+    return {
+        "ms_backward": _median(lambda: program(dresser.predictor.state, q, p)) / batch,
+        "backward_mb": _peak(program) / 1e6,
+    }
+
+
 def _network(dresser: Dresser, batch: int) -> float:
-    predictor = fold_batch_norm(dresser.predictor)
+    predictor = dresser.predictor
     templates = tuple(dict.fromkeys(w.template for w in dresser.wearables))
     features = jnp.zeros(
         (batch, predictor.surface.rest.shape[0], predictor.config.inputs.channels), jnp.float32

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from ..body import Body, load_body
 from ..errors import PhysXNetError
 from ..garment import Garment
+from ..geometry import Smoothing
 from ..io import DEFAULT, AnimatedMesh, load_garment, load_predictor
 from ..models import Predictor, Wearable, fold_batch_norm, make_surface, make_wearable
 from ..motion import (
@@ -222,7 +223,7 @@ def unbound_wearable(body: Body, rest: Float[Array, "all 3"], garment: Garment) 
         none,
         garment.rest_vertices(rest),
         garment.skin,
-        None,
+        Smoothing(()),
         garment.template,
         garment.name,
     )

@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 from collections.abc import Sequence
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -15,8 +16,8 @@ from ..models import (
     Predictor,
     Stream,
     Wearable,
+    at_precision,
     dress_frames,
-    fold_batch_norm,
     pad_clip,
     start_stream,
     stream_frame,
@@ -25,6 +26,8 @@ from ..typing import pytree
 from ._dress import bound_wearable, fit_surface
 from ._meshes import with_names
 from ._push_out import SkinPatch, make_patch, push_out, tuck_in
+
+Precision = Literal["float32", "bfloat16"]
 
 
 @pytree
@@ -58,6 +61,7 @@ def make_dresser(
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
     resolve: bool = True,
+    precision: Precision = "float32",
 ) -> Dresser:
     """Loads weights and binds garments, once for all poses.
 
@@ -67,6 +71,7 @@ def make_dresser(
         body: The body; the built-in one by default.
         shape: Shape parameters; the default shape if omitted.
         resolve: Push vertices that end inside the body onto it.
+        precision: Of the network's arithmetic; all else stays float32.
 
     Raises:
         PhysXNetError: Anything that can't be read or bound; the text says why.
@@ -77,7 +82,7 @@ def make_dresser(
         [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
     )
     predictor = weights if isinstance(weights, Predictor) else load_predictor(weights)
-    predictor = fold_batch_norm(fit_surface(predictor, body, rest, shape))
+    predictor = at_precision(fit_surface(predictor, body, rest, shape), precision)
     wearables = tuple(bound_wearable(predictor, body, rest, g) for g in garments)
     patches = tuck_in(
         [make_patch(body, rest, w, g.mesh) for w, g in zip(wearables, garments, strict=True)],

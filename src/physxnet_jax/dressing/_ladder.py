@@ -11,6 +11,7 @@ from typing import Any
 
 import jax
 
+from .._environment import cache_folder
 from ..errors import PhysXNetError
 from ..evaluation import Method as Measured
 from ..files import whole_file
@@ -82,9 +83,8 @@ def load_ladder() -> list[Rung]:
 
 
 def calibration_file() -> pathlib.Path:
-    """Where this machine's times are kept: $XDG_CACHE_HOME or ~/.cache."""
-    home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
-    return pathlib.Path(home) / "physxnet_jax" / "calibration.json"
+    """Where this machine's times are kept."""
+    return cache_folder() / "calibration.json"
 
 
 def calibrate(

@@ -7,7 +7,7 @@ import jax
 from jaxtyping import Array
 
 from ..body import load_body
-from ..evaluation import Blockwise, Method, Simulator, network, skinning
+from ..evaluation import NOISE, Blockwise, Method, Simulator, network, skinning
 from ..garment import Template, template
 from ..io import load_predictor
 from ..models import Predictor, Wearable, dress_frames
@@ -34,6 +34,9 @@ def pushed_network(predictor: Predictor) -> Blockwise:
 def method_by_name(name: str) -> Method:
     """A way to dress by its name: ``lbs``, an accuracy of the simulator, a network's.
 
+    ``noise`` is the simulator from almost the same start: how far two runs part that
+    should be one is the least error that means anything.
+
     Args:
         name: A network is called by its weights' name or folder, or a run's folder; with
             ``+push`` behind it its vertices are pushed out of the body.
@@ -43,6 +46,8 @@ def method_by_name(name: str) -> Method:
     """
     if name == "lbs":
         return skinning()
+    if name == "noise":
+        return Simulator("standard", moved=NOISE)
     if name in ACCURACY:
         return Simulator(name)
     predictor = load_predictor(weights_folder(name.removesuffix("+push")))

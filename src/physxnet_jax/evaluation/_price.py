@@ -4,7 +4,6 @@ import dataclasses
 import time
 from collections.abc import Callable, Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -103,8 +102,8 @@ def price_effects(
         )
         whole = rollout if whole is None else whole
         rows.append(row)
-        # Programs of other effects are never run again.
-        jax.clear_caches()
+        # The program of these effects is never run again.
+        advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
         if progress is not None:
             progress(k + 1, len(variants))
     return rows
@@ -178,7 +177,7 @@ def recommend_effects(
                 needed = False
                 said = f"Cloth never comes nearer to itself than {1e3 * min(least, 1.0):.1f} mm."
         out.append(Advice(name, needed, said))
-        jax.clear_caches()
+        advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
         if progress is not None:
             progress(k + 1, len(extra))
     return out

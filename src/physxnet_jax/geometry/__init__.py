@@ -22,7 +22,12 @@ from ._rotation import (
     safe_norm as safe_norm,
     safe_normalize as safe_normalize,
 )
-from ._stencil import Stencil as Stencil, gaussian_stencil as gaussian_stencil
+from ._stencil import (
+    Smoothing as Smoothing,
+    Stencil as Stencil,
+    gaussian_smoothing as gaussian_smoothing,
+    gaussian_stencil as gaussian_stencil,
+)
 from ._topology import (
     Edges as Edges,
     boundary_loops as boundary_loops,

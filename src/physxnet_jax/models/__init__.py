@@ -9,7 +9,7 @@ from ._features import (
     point_features as point_features,
     skin_points as skin_points,
 )
-from ._fold import fold_batch_norm as fold_batch_norm
+from ._fold import at_precision as at_precision, fold_batch_norm as fold_batch_norm
 from ._networks import Discriminator as Discriminator, Generator as Generator
 from ._predictor import (
     ModelConfig as ModelConfig,

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..body import Body
 from ..garment import Garment
-from ..geometry import Stencil, gaussian_stencil, polar_rotation
+from ..geometry import Smoothing, gaussian_smoothing, polar_rotation
 from ..typing import pytree
 from ..uv import Atlas, Binding, dress_body
 from ._features import Family, Inputs, clip_features, skin_points
@@ -21,9 +21,9 @@ _EXACT = jax.lax.Precision.HIGHEST
 # Normalised lengths beyond this are no motion of a person's; of 0.1 % of texels in training
 # a component exceeds 1. Places are in metres.
 _FARTHEST = 3.0
-# A skirt samples maps of both legs, whose edges don't meet: offsets are averaged over
-# about this distance along the cloth [m].
-_SMOOTH = 0.03
+# Texels are wider than the gaps between vertices; a skirt also samples maps of both legs,
+# whose edges don't meet. Offsets are averaged over about this distance along the cloth [m].
+_SMOOTH, _SMOOTH_SKIRT = 0.015, 0.03
 
 
 @dataclasses.dataclass(frozen=True)
@@ -163,8 +163,9 @@ class Predictor:
         """Offsets [m] from normalised features, see `normalise`."""
         network = nnx.merge(self.graph, self.state)
         network.eval()
-        maps = self.atlas.to_map(features)
-        out = network(maps, tuple(templates))
+        # All parameters have one type: float32, or what `at_precision` made of it.
+        dtype = jax.tree.leaves(self.state)[0].dtype
+        out = network(self.atlas.to_map(features).astype(dtype), tuple(templates))
         return {
             t: jnp.where(
                 self.surface.valid[t][None, :, None],
@@ -229,8 +230,7 @@ class Wearable:
         binding: Texels they sample and body points they belong to.
         anchor: Body points at rest that the binding names [m], shape [vertices, 3].
         anchor_weights: Their skinning weights, shape [vertices, joints].
-        smoothing: Mean over the neighbourhood that sampled offsets pass twice; None
-            for cloth that lies on the skin.
+        smoothing: Means over neighbourhoods that sampled offsets pass.
         template: The map this garment is dressed by.
         name: Name of the garment.
     """
@@ -240,7 +240,7 @@ class Wearable:
     binding: Binding
     anchor: Float[Array, "vertices 3"]
     anchor_weights: Float[Array, "vertices joints"]
-    smoothing: Stencil | None
+    smoothing: Smoothing
     template: str = dataclasses.field(metadata={"static": True})
     name: str = dataclasses.field(metadata={"static": True})
 
@@ -248,22 +248,19 @@ class Wearable:
         self, values: Float[Array, "*batch texels channels"]
     ) -> Float[Array, "*batch vertices channels"]:
         """Texel values carried to the garment's vertices."""
-        out = self.binding.sample(values)
-        if self.smoothing is not None:
-            out = self.smoothing @ (self.smoothing @ out)
-        return out
+        return self.smoothing @ self.binding.sample(values)
 
 
 def make_wearable(
     body: Body, rest: Float[Array, "all 3"], garment: Garment, binding: Binding
 ) -> Wearable:
     """A garment ready to be dressed on a body shape."""
-    base = rest
-    smoothing = None
+    base, radius = rest, _SMOOTH
     if garment.template == "dress":
         base = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
-        mesh = garment.mesh
-        smoothing = gaussian_stencil(np.asarray(mesh.vertices), np.asarray(mesh.faces), _SMOOTH)
+        radius = _SMOOTH_SKIRT
+    mesh = garment.mesh
+    smoothing = gaussian_smoothing(np.asarray(mesh.vertices), np.asarray(mesh.faces), radius)
     return Wearable(
         garment.rest_vertices(rest),
         garment.skin,

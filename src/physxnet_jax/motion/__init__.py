@@ -27,4 +27,10 @@ from ._transforms import (
     clip_transforms as clip_transforms,
     padded_block as padded_block,
 )
-from ._variants import at_speed as at_speed, mirror_joints as mirror_joints, mirrored as mirrored
+from ._variants import (
+    at_speed as at_speed,
+    exaggerated as exaggerated,
+    mirror_joints as mirror_joints,
+    mirrored as mirrored,
+    with_upper_body as with_upper_body,
+)

@@ -1,0 +1,27 @@
+"""The ladder's rung `small`: `local_cpu.py` with 16 channels in the first layer.
+
+Command: physxnet train experiments/configs/local_small_cpu.py --name small
+         --data runs/ours --data runs/mirror --data runs/extra --data runs/extra_mirror
+         --data runs/mixed --splits train extra --out runs/small
+Cost:    not measured yet.
+Result:  the rows `small` of experiments/results/test_errors.md.
+
+The recipe and the data are those of `local_cpu.py`.
+"""
+
+from physxnet_jax.models import Inputs, ModelConfig
+from physxnet_jax.training import TrainConfig
+
+CONFIG = TrainConfig(
+    model=ModelConfig(Inputs("local"), resolution=64, width=16),
+    epochs=5,
+    batch=8,
+    learning_rate=3e-3,
+    schedule="cosine",
+    adversarial=False,
+    vertex_share=0.7,
+    validation=("kick ball",),
+    validate_every=760,
+    patience=12,
+    checkpoint_every=760,
+)

@@ -1,0 +1,68 @@
+"""What is kept between runs, and where."""
+
+import os
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+from physxnet_jax._environment import cache_folder, keep_programs, keeps_programs
+
+
+def test_what_is_set_already_stays(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_folder() == tmp_path / "physxnet_jax"
+    env = {"JAX_COMPILATION_CACHE_DIR": "/elsewhere"}
+    keep_programs(env)
+    assert env["JAX_COMPILATION_CACHE_DIR"] == "/elsewhere"
+    empty: dict[str, str] = {}
+    keep_programs(empty)
+    folder = pathlib.Path(empty["JAX_COMPILATION_CACHE_DIR"])
+    assert folder.parent == tmp_path / "physxnet_jax" / "programs"
+
+
+def test_processors_have_folders_of_their_own(monkeypatch):
+    seen = set()
+    for flags in ("flags: sse avx", "flags: sse"):
+        monkeypatch.setattr("physxnet_jax._environment._processor", lambda f=flags: f)
+        env: dict[str, str] = {}
+        keep_programs(env)
+        seen.add(env["JAX_COMPILATION_CACHE_DIR"])
+    assert len(seen) == 2
+
+
+@pytest.fixture
+def run(tmp_path):
+    def one(*words):
+        env = {k: v for k, v in os.environ.items() if k != "TF_CPP_MIN_LOG_LEVEL"}
+        env |= {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+        return subprocess.run(
+            [pathlib.Path(sys.executable).parent / "physxnet", *words],
+            env=env,
+            capture_output=True,
+            text=True,
+            cwd=tmp_path,
+        )
+
+    return one
+
+
+def test_a_second_run_finds_its_programs_and_says_nothing_of_them(run, tmp_path):
+    words = ("dress", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "2", "--quiet")
+    first = run(*words, "--out", "a.npz")
+    assert first.returncode == 0, first.stderr
+    kept = sorted((tmp_path / "cache").rglob("*-cache"))
+    assert kept
+    second = run(*words, "--out", "b.npz")
+    assert second.returncode == 0 and second.stderr == first.stderr == ""
+    assert sorted((tmp_path / "cache").rglob("*-cache")) == kept, "nothing new was compiled"
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_only_commands_that_do_not_measure_compilation_keep_programs():
+    assert keeps_programs(["/usr/bin/physxnet", "dress", "walk"])
+    assert keeps_programs(["physxnet"]) and keeps_programs(["C:/bin/physxnet.exe", "train"])
+    assert not keeps_programs(["physxnet", "bench", "net"])
+    assert not keeps_programs(["physxnet", "effects", "scene.toml"])
+    assert not keeps_programs(["my_program.py", "dress"])
