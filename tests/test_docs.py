@@ -45,6 +45,18 @@ def test_the_tables_are_the_measured_ones():
     assert len(rows) == len(FABRICS) and all(r in textile for r in rows)
 
 
+def test_costs_are_the_measured_ones():
+    text = (ROOT / "docs/accuracy-cost.md").read_text()
+    for name in ("accuracy_cost", "peers"):
+        block = re.search(rf"<!-- begin {name} -->\n(.*?)<!-- end {name} -->", text, re.S)
+        assert block and block.group(1) == (ROOT / f"experiments/results/{name}.md").read_text()
+    rows = json.loads((ROOT / "experiments/results/accuracy_cost.json").read_text())["rows"]
+    named = {r["size"] for r in rows if r["method"].startswith("network")}
+    words = re.search(r"physxnet (bench net.*)", text).group(1).split()
+    assert named == set(words[words.index("--weights") + 1 : words.index("--garments")])
+    assert named <= set(list_weights())
+
+
 def test_the_reproduction_shows_what_was_measured():
     """Tables and claims are made of the rows, and the shipped cards say the same."""
     text = (ROOT / "docs/reproduction.md").read_text()
