@@ -1,5 +1,6 @@
 """The table of networks: whole rows, nothing measured twice, times that belong together."""
 
+import dataclasses
 import json
 
 import jax.numpy as jnp
@@ -9,8 +10,9 @@ from flax import nnx
 
 from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
+from physxnet_jax.cli._bench_net import points
 from physxnet_jax.data import Sequence
-from physxnet_jax.dressing import mean_errors
+from physxnet_jax.dressing import Cost, mean_errors
 from physxnet_jax.evaluation import skinning
 from physxnet_jax.garment import TEMPLATES, template
 from physxnet_jax.io import save_predictor
@@ -81,6 +83,24 @@ def test_mean_errors_are_those_of_the_actions():
     found = mean_errors(skinning(), [*off, spoiled], TEMPLATES)
     assert list(found) == ["bottom"]
     assert found["bottom"] == pytest.approx(4.0, rel=1e-3)
+
+
+def test_panels_are_numbers_of_garments_and_lines_run_through_sizes():
+    nan = float("nan")
+
+    def row(method, size, batch, garments, error):
+        return Cost(method, size, "cpu", batch, garments, error, 1.0, 0.5, 1.0, 9, nan, 0.1, nan)
+
+    rows = [row("lbs", "-", 16, k, 20.0) for k in (1, 2, 3)]
+    rows += [row("network", s, b, 3, 10.0) for s in ("small", "large") for b in (1, 32)]
+    rows += [row("network", "unknown", 1, 3, nan)]
+    found = points(rows)
+    assert {p[0] for p in found} == {"3 garments"}, "nothing to compare with one or two"
+    assert [p[1] for p in found].count("network, live") == 2
+    assert {p[1] for p in found} == {"lbs", "network, live", "network, 32 frames"}
+    low = [dataclasses.replace(r, precision="bfloat16") for r in rows]
+    assert points(low)[-1][1] == "network bfloat16, 32 frames"
+    assert len(points(rows[:3])) == 3, "without networks every number is shown"
 
 
 def test_what_is_missing_is_said(tmp_path, capsys):

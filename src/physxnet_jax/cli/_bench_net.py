@@ -4,12 +4,12 @@ import dataclasses
 import json
 import math
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from rich.console import Console
 
-from ..data import Sequence, list_sequences, read_sequence
+from ..data import Sequence as Action, list_sequences, read_sequence
 from ..dressing import (
     Cost,
     Precision,
@@ -36,7 +36,7 @@ def bench_net(command: Bench, console: Console) -> int:
     """Measures method by method; the rows of each are kept as soon as they are there."""
     if command.out is not None and command.out.suffix != ".json":
         raise FormatError(f"{command.out}: rows are written as .json.")
-    tests: list[Sequence] = []
+    tests: list[Action] = []
     if command.data is not None:
         tests = [read_sequence(f) for f in list_sequences(command.data, "test")]
         if not tests:
@@ -67,26 +67,13 @@ def bench_net(command: Bench, console: Console) -> int:
     if command.out is not None:
         with whole_file(command.out.with_suffix(".md")) as part:
             part.write_text(text)
-        draw_work_precision(
-            command.out.with_suffix(".png"),
-            [
-                (
-                    f"{r.garments} garments, batch {r.batch}",
-                    f"{r.method} {r.size}" + (" bf16" if r.precision == "bfloat16" else ""),
-                    r.rmse_mm,
-                    r.ms_per_frame,
-                )
-                for r in rows
-                if not math.isnan(r.rmse_mm)
-            ],
-            {},
-        )
+        draw_work_precision(command.out.with_suffix(".png"), points(rows), {})
         console.print(f"wrote {command.out}, .md and .png", highlight=False)
     return 0
 
 
 def _measure(
-    kind: str, size: str, precision: Precision, command: Bench, tests: list[Sequence]
+    kind: str, size: str, precision: Precision, command: Bench, tests: list[Action]
 ) -> Iterator[Cost]:
     walk = load_motion("walk", fps=30.0)
     if kind != "network":
@@ -106,6 +93,21 @@ def _measure(
         precision=precision,
     ):
         yield dataclasses.replace(row, size=pathlib.Path(size).name)
+
+
+def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
+    """What is drawn: a panel for each number of garments, a line through a method's sizes."""
+    panels = {r.garments for r in rows if r.method.startswith("network")}
+    out = []
+    for r in rows:
+        if math.isnan(r.rmse_mm) or (panels and r.garments not in panels):
+            continue
+        name = r.method if r.precision == "float32" else f"{r.method} {r.precision}"
+        if r.method.startswith("network"):
+            name += ", live" if r.batch == 1 else f", {r.batch} frames"
+        panel = "one garment" if r.garments == 1 else f"{r.garments} garments"
+        out.append((panel, name, r.rmse_mm, r.ms_per_frame))
+    return out
 
 
 def _to_json(row: Cost) -> dict[str, Any]:
