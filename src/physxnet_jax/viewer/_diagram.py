@@ -74,6 +74,7 @@ def draw_bars(
         MissingDependencyError: matplotlib isn't installed.
     """
     try:
+        from matplotlib import colormaps
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
@@ -88,12 +89,16 @@ def draw_bars(
         axes = figure.add_subplot(len(panels), 1, k + 1)
         mine = {(a, m): v for p, a, m, v in bars if p == panel}
         actions = list(dict.fromkeys(a for a, _ in mine))
-        width = 0.8 / len(methods)
-        for i, method in enumerate(methods):
+        here = [m for m in methods if any(m == b for _, b in mine)]
+        width = 0.8 / len(here)
+        for i, method in enumerate(here):
             have = [(j, mine[a, method]) for j, a in enumerate(actions) if (a, method) in mine]
             if have:
                 at, values = zip(*have, strict=True)
-                axes.bar([j + (i + 0.5) * width - 0.4 for j in at], values, width, label=method)
+                # A method has one colour in all panels.
+                colour = colormaps["tab20"](methods.index(method) % 20)
+                places = [j + (i + 0.5) * width - 0.4 for j in at]
+                axes.bar(places, values, width, label=method, color=colour)
         axes.set(title=panel, ylabel=label)
         axes.set_xticks(range(len(actions)), actions, rotation=20, ha="right", fontsize=8)
         axes.grid(True, axis="y", alpha=0.3)
