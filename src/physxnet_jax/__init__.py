@@ -25,6 +25,7 @@ if _sys.argv[1:2] != ["doctor"]:
 
 from .body import Body as Body, load_body as load_body
 from .dressing import (
+    Clothed as Clothed,
     DressedClip as DressedClip,
     Dresser as Dresser,
     clothe as clothe,

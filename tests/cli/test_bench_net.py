@@ -40,12 +40,16 @@ def tiny(tmp_path_factory):
     return folder
 
 
-def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys, monkeypatch):
+@pytest.fixture
+def hasty(monkeypatch):
     monkeypatch.setattr("physxnet_jax.dressing._cost._SECONDS", 0.05)
     monkeypatch.setattr("physxnet_jax.dressing._cost._TIMES", 3)
+
+
+@pytest.mark.usefixtures("hasty")
+def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys):
     out = tmp_path / "net.json"
     words = ["bench", "net", "--weights", str(tiny), "--batches", "1", "3", "--garments", "1", "2"]
-    words += ["--backward"]
     assert main([*words, "--out", str(out)]) == 0
     assert "| network | tiny | 2 | 3 |" in capsys.readouterr().out
     rows = json.loads(out.read_text())["rows"]
@@ -57,7 +61,7 @@ def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys, monkeypatch):
     for r in mine:
         assert r["rmse_mm"] is None, "no dataset, no error"
         assert 0 < r["ms_network"] and 0 < r["ms_per_frame"] < 1e3 * r["cold_s"]
-        assert r["ms_backward"] > r["ms_per_frame"] and r["backward_mb"] > 1
+        assert r["ms_backward"] is None, "not asked for"
         assert r["flops"] > 1e6 and r["peak_mb"] > 1 and r["weights_mb"] < 0.2
     assert mine[0]["params"] == mine[-1]["params"] > 1000
     # A second garment has a decoder of its own to compute: counted, not timed.
@@ -66,6 +70,17 @@ def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys, monkeypatch):
     assert main([*words, "--out", str(out), "--quiet"]) == 0
     assert out.read_text() == before
     assert (tmp_path / "net.md").is_file() and (tmp_path / "net.png").is_file()
+
+
+@pytest.mark.usefixtures("hasty")
+def test_gradients_are_measured_when_asked_for(tiny, tmp_path):
+    out = tmp_path / "net.json"
+    words = ["--weights", str(tiny), "--batches", "1", "--garments", "1", "--backward", "--quiet"]
+    assert main(["bench", "net", *words, "--out", str(out)]) == 0
+    rows = [r for r in json.loads(out.read_text())["rows"] if r["size"] == "tiny"]
+    assert len(rows) == 2
+    for r in rows:
+        assert r["ms_backward"] > r["ms_per_frame"] and r["backward_mb"] > 1
 
 
 def test_mean_errors_are_those_of_the_actions():

@@ -39,13 +39,14 @@ def judge(dresser):
         def total(rotations, root):
             # Speed, not fps, is what changes: one program serves all cases.
             cloth = clothe(dresser, rotations, root, 30.0)
-            out = {}
+            out = {"ok": cloth.ok}
             for w in dresser.wearables:
                 skinned = jax.vmap(
                     lambda q, p, w=w: skin_wearable(w, *dresser.body.transforms(dresser.rest, q, p))
                 )(rotations, root)
                 out[w.name] = cloth[w.name] - skinned
-            return sum(jnp.sum(x * x) for x in out.values()) * scale, out
+            gaps = [x for name, x in out.items() if name != "ok"]
+            return sum(jnp.sum(x * x) for x in gaps) * scale, out
 
         (value, out), grads = jax.value_and_grad(total, argnums=(0, 1), has_aux=True)(
             rotations, root
@@ -83,6 +84,7 @@ def mirrored_quaternions(q, p):
 def test_cloth_stays_near_and_differentiable(judge, motion, case):
     value, out, grads, tangent = judge(*case(*motion))
     assert np.isfinite(value) and np.isfinite(tangent)
+    assert out.pop("ok").all()
     for x in out.values():
         assert np.isfinite(x).all() and np.linalg.norm(x, axis=2).max() < FAR
     assert all(np.isfinite(g).all() for g in grads)
@@ -100,6 +102,7 @@ def test_without_the_limit_a_teleport_tears_the_clothes_off(dresser, motion, mon
 
 def test_standing_still_is_a_fixed_point(judge, motion):
     _, out, _, _ = judge(*still(*motion))
+    del out["ok"]
     for x in out.values():
         np.testing.assert_allclose(np.asarray(x), np.asarray(x[:1]).repeat(FRAMES, 0), atol=1e-6)
 
@@ -107,6 +110,7 @@ def test_standing_still_is_a_fixed_point(judge, motion):
 def test_signs_of_quaternions_change_nothing(judge, motion):
     _, plain, _, _ = judge(*motion)
     _, flipped, _, _ = judge(*mirrored_quaternions(*motion))
+    del plain["ok"]
     for name, x in plain.items():
         np.testing.assert_allclose(np.asarray(flipped[name]), np.asarray(x), atol=1e-5)
 
@@ -120,6 +124,7 @@ def test_a_spoiled_frame_is_seen_in_its_window_alone(dresser, judge, motion):
     assert window == 5
     seen = np.arange(FRAMES)
     spoiled = (seen >= 1) & (seen < 1 + window)
+    np.testing.assert_array_equal(np.asarray(out.pop("ok")), ~spoiled)
     for name, x in out.items():
         whole = np.isfinite(np.asarray(x)).all(axis=(1, 2))
         np.testing.assert_array_equal(whole, ~spoiled)
@@ -166,3 +171,27 @@ def test_a_degenerate_triangle_harms_no_other(motion):
         for g in (garment, dataclasses.replace(garment, mesh=mesh))
     ]
     np.testing.assert_allclose(worn[1], worn[0], atol=1e-4)
+
+
+def test_cloth_beside_the_chart_is_bound_and_counted(motion):
+    """Trousers so long that they hang from the feet, where the atlas has no texels."""
+    from physxnet_jax.garment import template
+    from physxnet_jax.io import load_predictor
+    from physxnet_jax.uv import bind
+
+    body = load_body()
+    rest = body.rest_vertices(body.default_shape())
+    predictor = load_predictor("small")
+    valid = predictor.surface.valid["bottom"]
+    garment = template("bottom")
+    x = np.asarray(garment.mesh.vertices)
+    low = x[:, 1] < np.quantile(x[:, 1], 0.05)
+    longer = np.where(low[:, None], x + [0.0, -0.12, 0.04], x).astype(np.float32)
+    mesh = dataclasses.replace(garment.mesh, vertices=jnp.asarray(longer))
+    long = dataclasses.replace(garment, mesh=mesh)
+    lost = [bind(predictor.atlas, body, rest, g, valid).off_chart for g in (garment, long)]
+    assert lost[1] > lost[0]
+    worn = dress(Motion(*motion, 30.0), [long], weights="small", include_body=False).garments[0]
+    still = dress(Motion(*motion, 30.0), [long], method="lbs", include_body=False).garments[0]
+    gap = np.linalg.norm(worn.positions - still.positions, axis=2)
+    assert np.isfinite(gap).all() and gap.max() < FAR

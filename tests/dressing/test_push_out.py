@@ -1,13 +1,21 @@
 """The last push-out: what is inside comes out on its own side, the rest stays."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physxnet_jax.dressing import make_patch, push_out, skin_height, tuck_in, unbound_wearable
+from physxnet_jax.dressing import (
+    each_frame,
+    make_patch,
+    push_out,
+    skin_height,
+    tuck_in,
+    unbound_wearable,
+)
 from physxnet_jax.garment import template
 from physxnet_jax.models import skin_wearable
 from physxnet_jax.motion import clip_transforms, load_motion
@@ -84,6 +92,50 @@ def test_gradients_through_a_skirt_in_a_stride_are_finite(body, rest, stride):
 
     for g in jax.grad(height, argnums=(0, 1))(x, stride[0]):
         assert np.isfinite(np.asarray(g)).all() and np.abs(np.asarray(g)).max() > 0
+
+
+@pytest.mark.parametrize("name", ["bottom", "dress"])
+def test_frame_by_frame_is_all_at_once(body, rest, name):
+    """The way CPUs take against one batch; gradients where they compile quickly."""
+    world, shift = clip_transforms(body, rest, load_motion("walk", fps=30.0))
+    world, shift = jnp.asarray(world[:3]), jnp.asarray(shift[:3])
+    wearable, patch = fitted(body, rest, name)
+    x = jax.vmap(lambda r, t: skin_wearable(wearable, r, t))(world, shift)
+
+    def batched(points, rotations):
+        return jax.vmap(lambda p, r, t: push_out(patch, p, r, t))(points, rotations, shift)
+
+    def looped(points, rotations):
+        return each_frame(functools.partial(push_out, patch), points, rotations, shift)
+
+    found = []
+    for way in (batched, looped):
+        result = [jax.jit(way)(x, world)]
+        if name == "bottom":
+            grad = jax.grad(lambda p, r, way=way: jnp.mean(way(p, r) ** 2), argnums=(0, 1))
+            result += jax.jit(grad)(x, world)
+        found.append(result)
+    for a, b in zip(*found, strict=True):
+        np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=1e-6)
+
+
+def test_a_gradient_keeps_no_frame_in_memory(body, rest):
+    """Ten frames more cost what goes in and out of them, not what lies between."""
+    wearable, patch = fitted(body, rest, "bottom")
+    joints = wearable.skin.shape[1]
+
+    def memory(frames: int) -> int:
+        shapes = ((frames, *wearable.rest.shape), (frames, joints, 3, 3), (frames, joints, 3))
+        arrays = [jax.ShapeDtypeStruct(s, jnp.float32) for s in shapes]
+
+        def total(*values):
+            return jnp.sum(each_frame(functools.partial(push_out, patch), *values))
+
+        program = jax.jit(jax.grad(total, argnums=(0, 1, 2))).lower(*arrays).compile()
+        return program.memory_analysis().temp_size_in_bytes
+
+    room = wearable.rest.size * 4
+    assert (memory(12) - memory(2)) / 10 < 8 * room
 
 
 def test_long_edges_stand_off_farther(body, rest):

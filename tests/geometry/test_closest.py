@@ -11,6 +11,7 @@ from physxnet_jax.geometry import (
     closest_among,
     closest_barycentric,
     closest_points,
+    least_index,
     make_mesh,
     nearby_faces,
     signed_distance,
@@ -85,3 +86,29 @@ def test_candidates_find_what_brute_force_finds(body):
     miss = np.sqrt(np.asarray(quick.squared_distance)) - np.sqrt(np.asarray(exact.squared_distance))
     assert (miss > -1e-5).all()
     assert (miss > 1e-5).mean() < 0.01 and miss.max() < 2e-3
+
+
+def test_the_least_index_is_that_of_argmin():
+    rng = np.random.default_rng(3)
+    values = rng.integers(0, 5, (200, 7)).astype(np.float32)
+    values[0] = np.inf
+    np.testing.assert_array_equal(np.asarray(least_index(jnp.asarray(values))), values.argmin(1))
+    assert int(least_index(jnp.full((1, 7), jnp.nan))[0]) == 6
+
+
+def test_the_distance_falls_along_its_gradient(body):
+    """Derivatives go through the triangle that was taken, as of the exact search."""
+    mesh = body.rest_mesh()
+    v = np.asarray(mesh.vertices)
+    points = (v[::600] + np.array([0.01, 0.02, 0.015])).astype(np.float32)
+    near = jnp.asarray(nearby_faces(v, np.asarray(mesh.faces), points, neighbours=8))
+    p = jnp.asarray(points)
+
+    def squared(p):
+        return jnp.sum(closest_among(mesh, p, near).squared_distance)
+
+    hit = closest_among(mesh, p, near)
+    foot = jnp.einsum("pk,pkc->pc", hit.weights, mesh.vertices[mesh.faces[hit.face]])
+    np.testing.assert_allclose(
+        np.asarray(jax.grad(squared)(p)), np.asarray(2.0 * (p - foot)), atol=1e-5
+    )

@@ -17,6 +17,7 @@ from ._dress import (
     unbound_wearable as unbound_wearable,
 )
 from ._dresser import (
+    Clothed as Clothed,
     Dresser as Dresser,
     Precision as Precision,
     clothe as clothe,
@@ -41,6 +42,7 @@ from ._method import (
 )
 from ._push_out import (
     SkinPatch as SkinPatch,
+    each_frame as each_frame,
     make_patch as make_patch,
     push_out as push_out,
     skin_height as skin_height,

@@ -15,7 +15,7 @@ from ..garment import Garment
 from ..models import Predictor, Wearable, dress_frames, skin_wearable
 from ..motion import BLOCK, Motion, padded_block
 from ..simulation import ACCURACY, Scene, prepare_scene, simulate_batch, standard_effects
-from ._push_out import SkinPatch, push_out, skin_height
+from ._push_out import SkinPatch, each_frame, push_out, skin_height
 from ._stages import Stage
 
 
@@ -43,10 +43,12 @@ def dress_block(
         raw = dress_frames(predictor, wearables, rotations, translations, fps)
     out = []
     for x, patch in zip(raw, patches, strict=True):
-        height = jax.vmap(lambda p, a, b, q=patch: skin_height(q, p, a, b)[0])(x, r, t)
+
+        def one(x: Array, r: Array, t: Array, q: SkinPatch = patch) -> tuple[Array, Array]:
+            return push_out(q, x, r, t) if resolve else x, skin_height(q, x, r, t)[0]
+
+        x, height = each_frame(one, x, r, t)
         inside = jnp.mean((height < 0).astype(x.dtype), axis=1)
-        if resolve:
-            x = jax.vmap(lambda p, a, b, q=patch: push_out(q, p, a, b))(x, r, t)
         out.append((x, inside))
     return tuple(out)
 
@@ -141,4 +143,4 @@ def inside_share(
 
 @jax.jit
 def _heights(patch: SkinPatch, x: Array, r: Array, t: Array) -> Array:
-    return jax.vmap(lambda p, a, b: skin_height(patch, p, a, b)[0])(x, r, t)
+    return each_frame(lambda p, a, b: skin_height(patch, p, a, b)[0], x, r, t)

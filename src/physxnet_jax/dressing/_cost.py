@@ -237,7 +237,7 @@ def _gradient(dresser: Dresser, motion: Motion, batch: int) -> dict[str, float]:
         worn = dataclasses.replace(
             dresser, predictor=dataclasses.replace(dresser.predictor, state=state)
         )
-        squares = [jnp.sum(x * x) for x in clothe(worn, q, p, motion.fps).values()]
+        squares = [jnp.sum(x * x) for x in clothe(worn, q, p, motion.fps).vertices.values()]
         return functools.reduce(jnp.add, squares)
 
     backward = jax.jit(jax.value_and_grad(total, argnums=(0, 1, 2)))

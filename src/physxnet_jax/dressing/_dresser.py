@@ -1,13 +1,14 @@
 """Clothes as a layer: one pure function from joint rotations to clothed vertices."""
 
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Sequence
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..body import Body, load_body
 from ..garment import Garment
@@ -25,7 +26,7 @@ from ..models import (
 from ..typing import pytree
 from ._dress import bound_wearable, fit_surface
 from ._meshes import with_names
-from ._push_out import SkinPatch, make_patch, push_out, tuck_in
+from ._push_out import SkinPatch, each_frame, make_patch, push_out, tuck_in
 
 Precision = Literal["float32", "bfloat16"]
 
@@ -52,6 +53,30 @@ class Dresser:
     patches: tuple[SkinPatch, ...]
     faces: tuple[Int[Array, "faces 3"], ...]
     resolve: bool = dataclasses.field(metadata={"static": True})
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class Clothed:
+    """Clothes in a pose, or in each of several frames.
+
+    Attributes:
+        vertices: Vertices of each garment by name [m], shape [*frames, vertices, 3].
+        ok: Whether all of them are finite: a joint that isn't spoils the frames whose
+            window holds it, and no other.
+    """
+
+    vertices: dict[str, Float[Array, "*frames vertices 3"]]
+    ok: Bool[Array, "*frames"]
+
+    def __getitem__(self, name: str) -> Float[Array, "*frames vertices 3"]:
+        """Vertices of a garment [m]."""
+        return self.vertices[name]
+
+
+def _clothed(vertices: dict[str, Array]) -> Clothed:
+    finite = [jnp.all(jnp.isfinite(x), axis=(-2, -1)) for x in vertices.values()]
+    return Clothed(vertices, functools.reduce(jnp.logical_and, finite))
 
 
 def make_dresser(
@@ -97,7 +122,7 @@ def clothe(
     rotations: Float[Array, "frames joints 4"],
     root: Float[Array, "frames 3"],
     fps: float,
-) -> dict[str, Float[Array, "frames vertices 3"]]:
+) -> Clothed:
     """Clothes in successive frames; pure, for `jax.jit`, `jax.vmap` and `jax.grad`.
 
     Before the first frame the person is taken to have stood still.
@@ -110,7 +135,7 @@ def clothe(
         fps: Frames a second; static under `jax.jit`.
 
     Returns:
-        Vertices [m] by garment's name.
+        Vertices of each garment, and which frames are usable.
 
     Example:
         >>> from physxnet_jax.motion import load_motion
@@ -131,9 +156,9 @@ def clothe(
     out = {}
     for w, x, patch in zip(dresser.wearables, raw, dresser.patches, strict=True):
         if dresser.resolve:
-            x = jax.vmap(lambda p, r, t, q=patch: push_out(q, p, r, t))(x, world, shift)
+            x = each_frame(functools.partial(push_out, patch), x, world, shift)
         out[w.name] = x
-    return out
+    return _clothed(out)
 
 
 def start_clothing(
@@ -156,7 +181,7 @@ def clothe_frame(
     rotations: Float[Array, "joints 4"],
     root: Float[Array, "3"],
     fps: float,
-) -> tuple[Stream, dict[str, Float[Array, "vertices 3"]]]:
+) -> tuple[Stream, Clothed]:
     """The next frame's clothes, for live use; the same as `clothe` of the whole clip.
 
     Under `jax.jit` make ``fps`` static and donate ``stream``.
@@ -169,11 +194,11 @@ def clothe_frame(
         fps: Frames a second.
 
     Returns:
-        The stream for the next frame, and vertices [m] by garment's name.
+        The stream for the next frame, and this frame's clothes.
     """
     world, shift = dresser.body.transforms(dresser.rest, rotations, root)
     stream, raw = stream_frame(dresser.predictor, dresser.wearables, stream, world, shift, fps)
     out = {}
     for w, x, patch in zip(dresser.wearables, raw, dresser.patches, strict=True):
         out[w.name] = push_out(patch, x, world, shift) if dresser.resolve else x
-    return stream, out
+    return stream, _clothed(out)

@@ -24,12 +24,13 @@ _PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 _LOADER = '''"""Clothes from joint rotations: needs jax, numpy and flatbuffers, nothing else.
 
 >>> dress = load(".")                             # doctest: +SKIP
->>> cloth = dress(rotations, root)                # doctest: +SKIP
+>>> cloth, ok = dress(rotations, root)            # doctest: +SKIP
 
 rotations: [frames, joints, 4], unit quaternions wxyz relative to the parent joint; root:
 [frames, 3] in metres, Y up; both float32, card.json names the joints and the rate that
-frames must have. Returns a dictionary of vertices [frames, vertices, 3] in metres;
-garments.npz holds the triangles. Any number of frames; each new number compiles once.
+frames must have. Returns a dictionary of vertices [frames, vertices, 3] in metres, and
+which frames are finite; garments.npz holds the triangles. Any number of frames; each new
+number compiles once.
 """
 
 import hashlib
@@ -91,7 +92,8 @@ def export_dresser(
     shapes = [jax.ShapeDtypeStruct((frames, *rest), jnp.float32) for rest in ((joints, 4), (3,))]
 
     def whole(rotations: Any, root: Any) -> Any:
-        return clothe(dresser, rotations, root, fps)
+        clothed = clothe(dresser, rotations, root, fps)
+        return clothed.vertices, clothed.ok
 
     blob = bytes(export.export(jax.jit(whole), platforms=platforms)(*shapes).serialize())
     card = {

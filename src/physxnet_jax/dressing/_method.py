@@ -12,7 +12,7 @@ from ..garment import Template, template
 from ..io import load_predictor
 from ..models import Predictor, Wearable, dress_frames
 from ..simulation import ACCURACY
-from ._push_out import SkinPatch, make_patch, push_out
+from ._push_out import SkinPatch, each_frame, make_patch, push_out
 
 _Worn = tuple[Predictor, Wearable, SkinPatch]
 
@@ -65,4 +65,4 @@ def _block(worn: _Worn, r: Array, t: Array, fps: float) -> Array:
     predictor, wearable, patch = worn
     cloth = dress_frames(predictor, [wearable], r, t, fps)[0]
     last = slice(predictor.config.inputs.window - 1, None)
-    return jax.vmap(lambda p, a, b: push_out(patch, p, a, b))(cloth, r[last], t[last])
+    return each_frame(functools.partial(push_out, patch), cloth, r[last], t[last])

@@ -1,7 +1,8 @@
 """The last touch: vertices that a prediction left inside the body move onto it."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,8 @@ from ..geometry import (
 from ..models import Wearable, skin_points
 from ..typing import pytree
 from ._skirt import SkirtPatch, make_skirt_patch, skirt_lift
+
+_Result = TypeVar("_Result")
 
 # Triangles compared for each vertex: a patch of about five centimetres.
 _PATCH = 20
@@ -45,7 +48,7 @@ class SkinPatch:
         normals: Their unit normals at rest, shape [skin, 3].
         weights: Their skinning weights, shape [skin, joints].
         faces: Triangles over them, shape [faces, 3].
-        candidates: Triangles near each garment vertex, shape [vertices, k].
+        candidates: Triangles near each vertex that lies on the skin, shape [lying, k].
         least: Least height above the skin [m], shape [vertices].
         most: Greatest height, for what is worn beneath something [m], shape [vertices].
         skirt: Legs that hanging cloth may meet; None for what lies on the skin.
@@ -56,7 +59,7 @@ class SkinPatch:
     normals: Float[Array, "skin 3"]
     weights: Float[Array, "skin joints"]
     faces: Int[Array, "faces 3"]
-    candidates: Int[Array, "vertices k"]
+    candidates: Int[Array, "lying k"]
     least: Float[Array, " vertices"]
     most: Float[Array, " vertices"]
     skirt: SkirtPatch | None
@@ -78,12 +81,15 @@ def make_patch(
     faces = np.asarray(mesh.faces)
     points = np.asarray(wearable.rest)
     middles = np.asarray(mesh.vertices)[faces].mean(axis=1)
-    near = KDTree(middles).query(points, k=_PATCH)[1]
+    lying = points
     skirt = carry = None
-    taken = near.ravel()
     if wearable.template == "dress":
         carry = gaussian_stencil(points, np.asarray(garment.faces), _CARRY)
         skirt = make_skirt_patch(body, rest, wearable, faces, garment, carry)
+        lying = points[np.asarray(skirt.lying)]
+    near = KDTree(middles).query(lying, k=_PATCH)[1].reshape(-1, _PATCH)
+    taken = near.ravel()
+    if skirt is not None:
         taken = np.concatenate([taken, np.asarray(skirt.table).ravel()])
     used, local = np.unique(taken, return_inverse=True)
     rows, corners = np.unique(faces[used], return_inverse=True)
@@ -100,7 +106,7 @@ def make_patch(
         jnp.asarray(corners.reshape(-1, 3).astype(np.int32)),
         jnp.asarray(local[: near.size].reshape(near.shape).astype(np.int32)),
         jnp.asarray(_least_height(points, np.asarray(garment.faces))),
-        jnp.full((near.shape[0],), jnp.inf, jnp.float32),
+        jnp.full((len(points),), jnp.inf, jnp.float32),
         skirt,
         carry,
     )
@@ -165,25 +171,38 @@ def skin_height(
     """
     skin, blend = skin_points(patch.rest, patch.weights, rotations, translations)
     normals = jnp.einsum("vab,vb->va", blend, patch.normals)
+    if patch.skirt is None:
+        return _clear_of_skin(patch, skin, normals, points, patch.least, patch.most)
+    lying, rows = patch.skirt.lying, patch.skirt.rows
+    low, lift = _clear_of_skin(
+        patch, skin, normals, points[lying], patch.least[lying], patch.most[lying]
+    )
+    turn = blend_rotations(patch.skirt.weights, rotations)
+    outward = safe_normalize(jnp.einsum("hab,hb->ha", turn, patch.skirt.outward))
+    lifted, above = skirt_lift(
+        patch.skirt, points[rows], outward, skin, normals, patch.faces, patch.least[rows]
+    )
+    order = patch.skirt.order
+    return jnp.concatenate([low, above])[order], jnp.concatenate([lift, lifted])[order]
+
+
+def _clear_of_skin(
+    patch: SkinPatch,
+    skin: Float[Array, "skin 3"],
+    normals: Float[Array, "skin 3"],
+    points: Float[Array, "lying 3"],
+    least: Float[Array, " lying"],
+    most: Float[Array, " lying"],
+) -> tuple[Float[Array, " lying"], Float[Array, "lying 3"]]:
     hit = closest_among(TriMesh(skin, patch.faces), points, patch.candidates)
-    tri = patch.faces[jax.lax.stop_gradient(hit.face)]
+    tri = patch.faces[hit.face]
     foot = jnp.einsum("vk,vkc->vc", hit.weights, skin[tri])
     normal = safe_normalize(jnp.einsum("vk,vkc->vc", hit.weights, normals[tri]))
     height = jnp.sum((points - foot) * normal, axis=1)
     # Deeper points are on another limb's far side, not in the skin.
     fade = jnp.clip((height + _DEEPEST) / (0.25 * _DEEPEST), 0.0, 1.0)
-    lift = fade * jnp.maximum(patch.least - height, 0.0) - jnp.maximum(height - patch.most, 0.0)
-    move = lift[:, None] * normal
-    if patch.skirt is not None:
-        rows = patch.skirt.rows
-        turn = blend_rotations(patch.skirt.weights, rotations)
-        outward = safe_normalize(jnp.einsum("hab,hb->ha", turn, patch.skirt.outward))
-        lifted, above = skirt_lift(
-            patch.skirt, points[rows], outward, skin, normals, patch.faces, patch.least[rows]
-        )
-        move = move.at[rows].set(lifted)
-        height = height.at[rows].set(above)
-    return height, move
+    lift = fade * jnp.maximum(least - height, 0.0) - jnp.maximum(height - most, 0.0)
+    return height, lift[:, None] * normal
 
 
 def push_out(
@@ -210,3 +229,21 @@ def push_out(
         return points + move
     points = points + patch.carry @ move
     return points + skin_height(patch, points, rotations, translations)[1]
+
+
+def each_frame(function: Callable[..., _Result], *frames: Float[Array, "frames ..."]) -> _Result:
+    """A function of one frame applied to each, differentiable.
+
+    CPUs take one frame after the other: what lies between fits their caches. A gradient
+    computes that anew instead of keeping it.
+
+    Args:
+        function: Of one frame of each array.
+        frames: Arrays of frames.
+    """
+    one = jax.checkpoint(function)
+    return jax.lax.platform_dependent(
+        *frames,
+        cpu=lambda *arrays: jax.lax.map(lambda frame: one(*frame), arrays),
+        default=jax.vmap(one),
+    )

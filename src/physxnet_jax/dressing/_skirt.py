@@ -1,11 +1,12 @@
 """Legs in a skirt: which skin a hanging vertex may meet, and the way out of it."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body
@@ -13,6 +14,7 @@ from ..geometry import (
     Stencil,
     TriMesh,
     closest_among,
+    least_index,
     safe_normalize,
     spread_points,
     vertex_normals,
@@ -39,17 +41,21 @@ class SkirtPatch:
 
     Attributes:
         rows: Hanging garment vertices, shape [hanging].
+        lying: All others, shape [lying].
+        order: Where each vertex stands in ``lying`` followed by ``rows``, shape [vertices].
         outward: The way out of the skirt at rest, unit, shape [hanging, 3].
         weights: Skinning weights of the hanging vertices, shape [hanging, joints].
-        choices: Skin points compared for each, rows of ``middles``, shape [hanging, c].
+        compared: Which of ``middles`` each is compared with, shape [hanging, patches].
         middles: Skin vertices that are compared, shape [patches].
         table: Triangles around each of them, shape [patches, k].
     """
 
     rows: Int[Array, " hanging"]
+    lying: Int[Array, " lying"]
+    order: Int[Array, " vertices"]
     outward: Float[Array, "hanging 3"]
     weights: Float[Array, "hanging joints"]
-    choices: Int[Array, "hanging c"]
+    compared: Bool[Array, "hanging patches"]
     middles: Int[Array, " patches"]
     table: Int[Array, "patches k"]
 
@@ -95,12 +101,17 @@ def make_skirt_patch(
     chosen = legs[spread_points(skin[legs], _SPACING)]
     k = min(_CHOICES, len(chosen))
     near = KDTree(skin[chosen]).query(points[rows], k=k)[1].reshape(len(rows), k)
+    compared = np.zeros((len(rows), len(chosen)), dtype=bool)
+    np.put_along_axis(compared, near, True, axis=1)
     table = KDTree(skin[faces].mean(axis=1)).query(skin[chosen], k=_PATCH)[1]
+    lying = np.setdiff1d(np.arange(len(points)), rows)
     return SkirtPatch(
         jnp.asarray(rows.astype(np.int32)),
+        jnp.asarray(lying.astype(np.int32)),
+        jnp.asarray(np.argsort(np.concatenate([lying, rows])).astype(np.int32)),
         jnp.asarray(outward),
         wearable.skin[jnp.asarray(rows)],
-        jnp.asarray(near.astype(np.int32)),
+        jnp.asarray(compared),
         jnp.asarray(chosen.astype(np.int32)),
         jnp.asarray(table.astype(np.int32)),
     )
@@ -141,34 +152,45 @@ def skirt_lift(
         Displacements [m] and heights above the nearest skin [m].
     """
     mesh = TriMesh(skin, faces)
-    lane = jnp.arange(points.shape[0])
-    gap = skin[patch.middles][patch.choices] - points[:, None]
-    along = jnp.einsum("hcx,hx->hc", gap, outward)
-    facing = jnp.einsum("hcx,hx->hc", normals[patch.middles][patch.choices], outward)
-    squared = jnp.sum(gap * gap, axis=-1)
+    # All pairs as products of matrices, about a point among them, where sums of squares are
+    # precise; which skin point is taken needs no derivative.
+    dense = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
+    about = jax.lax.stop_gradient(jnp.mean(points, axis=0, keepdims=True))
+    p, way_out, m, n = jax.lax.stop_gradient(
+        (points - about, outward, skin[patch.middles] - about, normals[patch.middles])
+    )
+    along = dense(way_out, m.T) - jnp.sum(p * way_out, axis=1)[:, None]
+    facing = dense(way_out, n.T)
+    squared = jnp.sum(p * p, axis=1)[:, None] + jnp.sum(m * m, axis=1)[None] - 2.0 * dense(p, m.T)
 
-    def meet(cost: Array, where: Array) -> tuple[Array, Array, Array]:
-        """Foot and normal of the skin near ``where``, on the patch of least cost."""
-        pick = jnp.argmin(cost, axis=1)
-        hit = closest_among(mesh, where, patch.table[patch.choices[lane, pick]])
-        tri = faces[jax.lax.stop_gradient(hit.face)]
+    def meet(pick: Array, where: Array) -> tuple[Array, Array]:
+        """Foot and normal of the skin near ``where``, on a patch."""
+        hit = closest_among(mesh, where, patch.table[pick])
+        tri = faces[hit.face]
         foot = jnp.einsum("hk,hkx->hx", hit.weights, skin[tri])
-        normal = safe_normalize(jnp.einsum("hk,hkx->hx", hit.weights, normals[tri]))
-        return foot, normal, cost[lane, pick]
+        return foot, safe_normalize(jnp.einsum("hk,hkx->hx", hit.weights, normals[tri]))
 
-    foot, near, _ = meet(squared, points)
+    foot, near = meet(_least(squared, patch.compared), points)
     height = jnp.sum((points - foot) * near, axis=1)
     short = jnp.maximum(least - height, 0.0)[:, None] * near
     # Skin in front of the vertex, seen along the way out.
-    ahead = (facing > _FACING) & (along > -_SPACING) & (along < _FARTHEST)
-    beside = jnp.where(ahead, squared - along * along, _NOWHERE)
-    reach = along[lane, jnp.argmin(beside, axis=1)]
-    there = points + reach[:, None] * outward
-    front, normal, cost = meet(beside, there)
+    ahead = patch.compared & (facing > _FACING) & (along > -_SPACING) & (along < _FARTHEST)
+    pick = _least(squared - along * along, ahead)
+    gap = skin[patch.middles[pick]] - points
+    reach = jnp.sum(gap * outward, axis=1)
+    # The way out passes beside that skin point by the root of the cost.
+    cost = jnp.sum(gap * gap, axis=1) - reach * reach
+    cost = jnp.where(jnp.any(ahead, axis=1), cost, _MISS)
+    front, normal = meet(pick, points + reach[:, None] * outward)
     slope = jnp.maximum(jnp.sum(normal * outward, axis=1), _FACING)
     way = (jnp.sum((front - points) * normal, axis=1) + least) / slope
-    # The way out passes beside the nearest skin point by the root of the cost.
     share = jnp.clip((_MISS - cost) / (_MISS - _HIT), 0.0, 1.0)
     share = (share * share * (3 - 2 * share))[:, None]
     long = jnp.clip(way, 0.0, _FARTHEST)[:, None] * outward
     return short + share * (long - short), height
+
+
+def _least(
+    cost: Float[Array, "hanging patches"], among: Bool[Array, "hanging patches"]
+) -> Int[Array, " hanging"]:
+    return least_index(jnp.where(among, cost, _NOWHERE))

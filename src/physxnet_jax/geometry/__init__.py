@@ -7,6 +7,7 @@ from ._closest import (
     closest_among as closest_among,
     closest_barycentric as closest_barycentric,
     closest_points as closest_points,
+    least_index as least_index,
     signed_distance as signed_distance,
 )
 from ._intersect import self_intersections as self_intersections

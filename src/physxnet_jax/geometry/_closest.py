@@ -153,14 +153,38 @@ def closest_among(
     Returns:
         As `closest_points`, over the candidates only.
     """
-    corner = [jnp.moveaxis(mesh.vertices[mesh.faces[candidates, k]], -1, 0) for k in range(3)]
-    p = jnp.broadcast_to(points.T[:, :, None], corner[0].shape)
-    w, d = closest_barycentric(p, *corner)
-    near = jnp.argmin(d, axis=1)
-    lane = jnp.arange(points.shape[0])
-    return ClosestPoints(
-        candidates[lane, near].astype(jnp.int32), w[:, lane, near].T, d[lane, near]
-    )
+    corners = mesh.vertices[mesh.faces].reshape(-1, 9)
+    p = points.T
+    # Only the triangle taken is differentiated: the others would fill the memory of a gradient.
+    face = _nearest(jax.lax.stop_gradient(corners), jax.lax.stop_gradient(p), candidates)
+    a, b, c = corners[face].T.reshape(3, 3, -1)
+    weights, squared = closest_barycentric(p, a, b, c)
+    return ClosestPoints(face, weights.T, squared)
+
+
+def _nearest(
+    corners: Float[Array, "faces 9"],
+    p: Float[Array, "3 points"],
+    candidates: Int[Array, "points k"],
+) -> Int[Array, " points"]:
+    """The nearest of each point's candidates, the first of equally near ones."""
+    # A triangle is copied as one row.
+    a, b, c = jnp.moveaxis(corners[candidates], -1, 0).reshape(3, 3, *candidates.shape)
+    _, squared = closest_barycentric(jnp.broadcast_to(p[:, :, None], a.shape), a, b, c)
+    near = least_index(squared)
+    return candidates[jnp.arange(near.shape[0]), near].astype(jnp.int32)
+
+
+def least_index(values: Float[Array, "rows columns"]) -> Int[Array, " rows"]:
+    """The column of each row's least value, the first of equal ones.
+
+    `jnp.argmin` that CPUs run in vectors: ten times faster on wide rows. A row with a NaN
+    gives the last column.
+    """
+    columns = values.shape[1]
+    index = jax.lax.broadcasted_iota(jnp.int32, values.shape, 1)
+    least = jnp.min(values, axis=1, keepdims=True)
+    return jnp.min(jnp.where(values <= least, index, columns - 1), axis=1)
 
 
 def signed_distance(
