@@ -73,6 +73,7 @@ VARIANTS: dict[str, tuple[TrainConfig, tuple[str, ...]]] = {
     "128 x 128": (varied(model={"resolution": 128}), ("data",)),
     "32 x 32": (varied(model={"resolution": 32}), ("data",)),
     "five frames": (varied(model=seen(frames=5)), ("data",)),
+    "three frames, five apart": (varied(model=seen(stride=5)), ("data",)),
     "256 x 256": (varied(model={"resolution": 256}), ("data",)),
     "and slower actions": (BASE, ("data", "slow")),
     "other engine": (BASE, ("other",)),

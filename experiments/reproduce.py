@@ -6,9 +6,10 @@ Cost:    about 40 minutes on two cores for all methods (penetration and the simu
 Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png;
          datasets.json; the tables between the marks of docs/reproduction.md,
          docs/accuracy-cost.md and README.md, with those of ablations.py, unseen.py,
-         bench_peers.py and `physxnet bench net`; and the measured table in the cards of the
-         packaged weights. Datasets are built by `physxnet dataset build`, weights trained by
-         `physxnet train`, both from experiments/configs.
+         bench_peers.py, bench_engines.py, bench_training.py and `physxnet bench net`; and
+         the measured table in the cards of the packaged weights. Datasets are built by
+         `physxnet dataset build`, weights trained by `physxnet train`, both from
+         experiments/configs.
 """
 
 import argparse
@@ -33,6 +34,8 @@ METHODS = (
     "nearest",
     "mlp",
     "runs/local-22",
+    "nano",
+    "nano+push",
     "small",
     "small+push",
     "local",
@@ -41,7 +44,7 @@ METHODS = (
     "draft",
     "noise",
 )
-NETWORKS = ("local-22", "small", "local", "paper")
+NETWORKS = ("local-22", "nano", "small", "local", "paper")
 SETS = {
     "ours": "protocol",
     "mirror": "mirrored training actions",
@@ -70,11 +73,19 @@ def main() -> None:
     note_datasets(pathlib.Path(words.learn_from).parent)
     blocks = {"summary": summary_table(rows), "errors": error_tables(rows), "claims": claims(rows)}
     blocks["datasets"] = dataset_table()
-    for name in ("ablations", "unseen", "accuracy_cost", "peers"):
+    for name in (
+        "ablations",
+        "unseen",
+        "accuracy_cost",
+        "peers",
+        "engines",
+        "training",
+        "blender_import",
+    ):
         path = RESULTS / f"{name}.md"
         if path.is_file():
             blocks[name] = path.read_text()
-    documents = ("docs/reproduction.md", "docs/accuracy-cost.md", "README.md")
+    documents = ("docs/reproduction.md", "docs/accuracy-cost.md", "docs/garments.md", "README.md")
     for path in (ROOT / name for name in documents if (ROOT / name).is_file()):
         text = path.read_text()
         for name, block in blocks.items():
@@ -90,9 +101,8 @@ def main() -> None:
 def write_ladder(rows: list[ActionError]) -> None:
     """The errors by which `physxnet dress --budget-ms` chooses."""
     # The teacher itself is as far from itself as two of its runs part.
-    names = {n: n for n in ("lbs", "small", "small+push", "local", "local+push", "draft")} | {
-        "noise": "standard"
-    }
+    shipped = [f"{n}{push}" for n in ("nano", "small", "local") for push in ("", "+push")]
+    names = {n: n for n in ("lbs", *shipped, "draft")} | {"noise": "standard"}
     rungs = []
     for method, name in names.items():
         found = {t: m for t in TEMPLATES if (m := means(rows, method, t, "physxnet"))}

@@ -4,7 +4,11 @@ import json
 import pathlib
 import re
 import runpy
+import shlex
 
+import pytest
+
+from physxnet_jax.cli import parse
 from physxnet_jax.data import DatasetConfig
 from physxnet_jax.dressing import load_scene
 from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
@@ -28,6 +32,22 @@ def test_the_code_runs_and_the_scene_file_loads(tmp_path):
     assert job.scene.garments[0].fabric.density == 0.07
 
 
+@pytest.mark.parametrize("name", [p.name for p in ROOT.glob("docs/*.md")] + ["README.md"])
+def test_every_command_is_understood(name, monkeypatch):
+    """Each line that begins with the command's name means something to it."""
+    path = ROOT / name if name == "README.md" else ROOT / "docs" / name
+    text = path.read_text()
+    lines = re.findall(r"^(?:\.venv/bin/)?physxnet (.*?)(?: *#.*)?$", text, re.M)
+    for line in lines:
+        parse(shlex.split(line))
+
+
+def test_every_link_leads_somewhere():
+    for path in [ROOT / "README.md", *ROOT.glob("docs/*.md")]:
+        for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", path.read_text()):
+            assert (path.parent / link).exists(), f"{path.name}: {link}"
+
+
 def test_every_effect_is_listed():
     assert all(f"`{name}`" in TEXT for name in EFFECTS)
 
@@ -47,7 +67,7 @@ def test_the_tables_are_the_measured_ones():
 
 def test_costs_are_the_measured_ones():
     text = (ROOT / "docs/accuracy-cost.md").read_text()
-    for name in ("accuracy_cost", "peers"):
+    for name in ("accuracy_cost", "peers", "engines", "training"):
         block = re.search(rf"<!-- begin {name} -->\n(.*?)<!-- end {name} -->", text, re.S)
         assert block and block.group(1) == (ROOT / f"experiments/results/{name}.md").read_text()
     rows = json.loads((ROOT / "experiments/results/accuracy_cost.json").read_text())["rows"]
@@ -55,6 +75,16 @@ def test_costs_are_the_measured_ones():
     words = re.search(r"physxnet (bench net.*)", text).group(1).split()
     assert named == set(words[words.index("--weights") + 1 : words.index("--garments")])
     assert named <= set(list_weights())
+
+
+def test_blender_saw_what_is_told():
+    text = (ROOT / "docs/garments.md").read_text()
+    block = re.search(
+        r"<!-- begin blender_import -->\n(.*?)<!-- end blender_import -->", text, re.S
+    )
+    measured = (ROOT / "experiments/results/blender_import.md").read_text()
+    assert block and block.group(1) == measured
+    assert all(float(x) < 1e-5 for x in re.findall(r"\| (\d\.\de-\d+) \|", measured))
 
 
 def test_the_reproduction_shows_what_was_measured():

@@ -3,8 +3,8 @@
 Command: physxnet train experiments/configs/local_nano_cpu.py --name nano
          --data runs/ours --data runs/mirror --data runs/extra --data runs/extra_mirror
          --data runs/mixed --splits train extra --out runs/nano
-Cost:    not run yet; estimated at a quarter of an hour on two cores.
-Result:  weights `nano`.
+Cost:    14 minutes on two cores beside other work: 9,005 steps.
+Result:  the rows `nano` of experiments/results/test_errors.md.
 
 The recipe and the data are those of `local_cpu.py`.
 """

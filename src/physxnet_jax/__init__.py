@@ -37,6 +37,8 @@ from .dressing import (
 from .errors import PhysXNetError as PhysXNetError
 from .garment import Fabric as Fabric, Garment as Garment, template as template
 from .io import (
+    fit_garment as fit_garment,
+    inspect_garment as inspect_garment,
     load_garment as load_garment,
     load_predictor as load_predictor,
     write_clip as write_clip,
@@ -53,6 +55,7 @@ from .uv import bind as bind, make_atlas as make_atlas
 
 __all__ = [
     "Body",
+    "Clothed",
     "DressedClip",
     "Dresser",
     "Fabric",
@@ -67,6 +70,8 @@ __all__ = [
     "clothe_frame",
     "dress",
     "dress_frames",
+    "fit_garment",
+    "inspect_garment",
     "load_body",
     "load_garment",
     "load_motion",

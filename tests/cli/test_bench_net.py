@@ -69,6 +69,12 @@ def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys):
     before = out.read_text()
     assert main([*words, "--out", str(out), "--quiet"]) == 0
     assert out.read_text() == before
+    assert main([*words, "--out", str(out), "--times", "--quiet"]) == 0
+    again = json.loads(out.read_text())["rows"]
+    assert [(r["method"], r["garments"], r["batch"]) for r in again] == [
+        (r["method"], r["garments"], r["batch"]) for r in rows
+    ]
+    assert [r["ms_per_frame"] for r in again] != [r["ms_per_frame"] for r in rows]
     assert (tmp_path / "net.md").is_file() and (tmp_path / "net.png").is_file()
 
 

@@ -183,7 +183,7 @@ def test_meshes_that_are_nowhere_near_a_body_are_refused(tmp_path):
 
 
 def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
-    assert list_weights() == ["local", "paper", "small"]
+    assert list_weights() == ["local", "nano", "paper", "small"]
     predictor = load_predictor("local")
     assert read_card("local")["model"]["inputs"]["family"] == "local"
     save_predictor(tmp_path / "w", predictor, name="copy")

@@ -1,3 +1,3 @@
 """The `physxnet` command: parse, call, print."""
 
-from ._main import main as main
+from ._main import main as main, parse as parse

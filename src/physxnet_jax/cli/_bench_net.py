@@ -52,9 +52,22 @@ def bench_net(command: Bench, console: Console) -> int:
         for k, (kind, size, precision) in enumerate(jobs):
             progress("methods", k, len(jobs))
             name = pathlib.Path(size).name
-            if any((r.method, r.size, r.precision) == (kind, name, precision) for r in rows):
-                continue
-            rows += list(_measure(kind, size, precision, command, tests))
+            # The rows of a network without and with push-out come together.
+            known = [
+                r
+                for r in rows
+                if (r.method.partition("+")[0], r.size, r.precision) == (kind, name, precision)
+            ]
+            if command.times:
+                # Errors don't change; a method without any isn't measured anew.
+                errors = {(r.method, r.garments): r.rmse_mm for r in known}
+                again = _measure(kind, size, precision, command, []) if known else ()
+                rows = [r for r in rows if r not in known] + [
+                    dataclasses.replace(r, rmse_mm=errors.get((r.method, r.garments), math.nan))
+                    for r in again
+                ]
+            elif not known:
+                rows += list(_measure(kind, size, precision, command, tests))
             if command.out is not None:
                 data = [_to_json(r) for r in rows]
                 with whole_file(command.out) as part:

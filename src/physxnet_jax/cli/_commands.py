@@ -23,7 +23,7 @@ class Dress:
     wear: tuple[str, ...] = ("top", "bottom")
     """Templates (top, bottom, dress) and OBJ files."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Result: .usdc, .usd, .usda, .pc2 (with OBJ) or .npz."""
+    """Result: .usdc, .usd, .usda, .pc2, .mdd (with OBJ), .glb, .html, .obj (one a frame), .npz."""
     preview: pathlib.Path | None = None
     """Picture or video: .png, .gif or .mp4."""
     method: Literal["network", "lbs", "simulate"] = "network"
@@ -50,6 +50,46 @@ class Dress:
     """Put the body into the result."""
     push_out: bool = True
     """Push vertices that end inside the body onto it."""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Inspect:
+    """Look at garment files: unit, axes, mesh, fit, binding; say what mends them.
+
+    Examples:
+      physxnet inspect my_shirt.obj
+      physxnet inspect *.obj --json
+    """
+
+    files: tyro.conf.Positional[tuple[pathlib.Path, ...]]
+    """OBJ files."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Fit:
+    """Make a garment file wearable: on the body, welded, clean, oriented, out of the skin.
+
+    Examples:
+      physxnet fit my_shirt.obj -o my_shirt_fitted.obj
+      physxnet fit scan.obj --like dress --edge-length 12 -o scan_fitted.obj
+    """
+
+    file: tyro.conf.Positional[pathlib.Path]
+    """An OBJ file; it isn't changed."""
+    out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
+    """The OBJ to write: metres, Y up, on the body at rest."""
+    like: Literal["top", "bottom", "dress"] | None = None
+    """Scale and move it to where this template is, instead of guessing its unit."""
+    edge_length: float | None = None
+    """Split or decimate towards edges of this length [mm]."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -143,7 +183,7 @@ class Simulate:
     wear: tuple[str, ...] = ("top", "bottom")
     """Templates (top, bottom, dress) and OBJ files; not with a scene file."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Result: .usdc, .usd, .usda, .pc2 (with OBJ) or .npz."""
+    """Result: .usdc, .usd, .usda, .pc2, .mdd (with OBJ), .glb, .html, .obj (one a frame), .npz."""
     preview: pathlib.Path | None = None
     """Picture or video: .png, .gif or .mp4."""
     accuracy: Literal["draft", "standard", "fine"] | None = None
@@ -220,6 +260,8 @@ class Bench:
     """net: what the networks' arithmetic is done in."""
     backward: bool = False
     """net: measure gradients as well."""
+    times: bool = False
+    """net: measure the times of these methods' rows again, and nothing else."""
     batches: tuple[int, ...] = (1, 32)
     """net: frames a call."""
     garments: tuple[int, ...] = (1, 2, 3)

@@ -14,6 +14,8 @@ from .._version import __version__
 _REQUIRED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy", "trimesh")
 _OPTIONAL = {
     "usd-core": "usd: writes .usdc",
+    "pygltflib": "gltf: writes .glb and .html",
+    "fast-simplification": "mesh: decimates garments",
     "pyvista": "render: pictures and videos",
     "imageio-ffmpeg": "render: .mp4",
     "viser": "viewer: in the browser",

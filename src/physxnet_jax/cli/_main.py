@@ -3,7 +3,7 @@
 import pathlib
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 from rich.console import Console
@@ -20,6 +20,8 @@ from ._commands import (
     Effects,
     Evaluate,
     Export,
+    Fit,
+    Inspect,
     Simulate,
     Stress,
     Train,
@@ -41,6 +43,8 @@ _Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Inspect, tyro.conf.subcommand("inspect")]
+    | Annotated[Fit, tyro.conf.subcommand("fit")]
 )
 
 
@@ -53,12 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         0 for success, 1 for a broken installation, 2 for an error of the user's.
     """
-    command = tyro.cli(
-        _Command,  # pyright: ignore[reportArgumentType]
-        prog="physxnet",
-        args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-    )
+    command = parse(arguments)
     console = Console(stderr=False)
     try:
         return _run(command, console)
@@ -79,6 +78,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 130
 
 
+def parse(arguments: Sequence[str] | None = None) -> Any:
+    """The command that words on a command line mean, not run; leaves if they mean none."""
+    return tyro.cli(
+        _Command,  # pyright: ignore[reportArgumentType]
+        prog="physxnet",
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes,),
+    )
+
+
 def _run(
     command: Dress
     | Demo
@@ -92,7 +101,9 @@ def _run(
     | Train
     | Evaluate
     | Export
-    | Calibrate,
+    | Calibrate
+    | Inspect
+    | Fit,
     console: Console,
 ) -> int:
     if isinstance(command, Dataset | Train | Evaluate):
@@ -105,6 +116,12 @@ def _run(
         from ._export import export
 
         return export(command, Console(quiet=True) if command.quiet else console)
+    if isinstance(command, Inspect | Fit):
+        from ._garments import fit, inspect
+
+        if isinstance(command, Inspect):
+            return inspect(command, console)
+        return fit(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Bench):
         from ._bench import bench
         from ._bench_net import bench_net

@@ -2,6 +2,7 @@
 
 from ._fit import (
     clearance as clearance,
+    lift_out as lift_out,
     set_clearance as set_clearance,
     smoothing_matrix as smoothing_matrix,
 )
@@ -13,6 +14,15 @@ from ._garment import (
     Garment as Garment,
     Template as Template,
     carried_weights as carried_weights,
+)
+from ._repair import (
+    MeshHealth as MeshHealth,
+    clean as clean,
+    decimate as decimate,
+    mesh_health as mesh_health,
+    orient as orient,
+    subdivide as subdivide,
+    weld as weld,
 )
 from ._sheet import (
     free_garment as free_garment,

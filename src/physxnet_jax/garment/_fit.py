@@ -1,9 +1,10 @@
 """Keeping a garment clear of the skin at rest."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..geometry import (
     TriMesh,
@@ -15,6 +16,9 @@ from ..geometry import (
     vertex_normals,
 )
 
+_ROWS = 2048
+_closest_among = jax.jit(closest_among)
+
 
 def clearance(
     body: TriMesh, points: Float[np.ndarray, "points 3"]
@@ -25,13 +29,16 @@ def clearance(
     flip for points inside.
     """
     vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
-    p = jnp.asarray(points, jnp.float32)
+    count = len(points)
+    # Meshes of about the same size share one program.
+    pick = np.minimum(np.arange(-(-count // _ROWS) * _ROWS), count - 1)
     near = nearby_faces(vertices, faces, np.asarray(points))
-    hit = closest_among(body, p, jnp.asarray(near))
-    distance = np.asarray(signed_distance(body, p, closest=hit))
+    p = jnp.asarray(np.asarray(points)[pick], jnp.float32)
+    hit = _closest_among(body, p, jnp.asarray(near[pick]))
+    distance = np.asarray(signed_distance(body, p, closest=hit))[:count]
     normals = np.asarray(vertex_normals(body.vertices, body.faces))
-    tri = faces[np.asarray(hit.face)]
-    away = np.einsum("pk,pkc->pc", np.asarray(hit.weights), normals[tri])
+    tri = faces[np.asarray(hit.face)[:count]]
+    away = np.einsum("pk,pkc->pc", np.asarray(hit.weights)[:count], normals[tri])
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
     return distance, away
 
@@ -74,6 +81,41 @@ def set_clearance(
             move = average @ move
         v += move
     return v
+
+
+def lift_out(
+    body: TriMesh,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    nearest: float,
+    *,
+    iterations: int = 8,
+) -> tuple[Float[np.ndarray, "vertices 3"], Bool[np.ndarray, " vertices"]]:
+    """A garment whose vertices keep a distance from the skin, and which had to be moved.
+
+    What is three times as far away stays where it is, bit for bit.
+
+    Args:
+        body: Closed body mesh.
+        vertices: Garment vertices [m].
+        faces: Garment triangles.
+        nearest: Wanted distance [m].
+        iterations: Passes of `set_clearance`.
+    """
+    distance, _ = clearance(body, vertices)
+    low = distance < nearest
+    if not low.any():
+        return vertices, low
+    count = len(vertices)
+    moved = set_clearance(
+        body,
+        vertices,
+        faces,
+        np.full(count, nearest),
+        free=np.ones(count),
+        iterations=iterations,
+    )
+    return np.where((distance < 3 * nearest)[:, None], moved, vertices), low
 
 
 def bridge_hollows(

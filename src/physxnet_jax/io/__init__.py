@@ -2,6 +2,14 @@
 
 from ._clip import AnimatedMesh as AnimatedMesh
 from ._garment import GarmentReport as GarmentReport, load_garment as load_garment
+from ._gltf import write_gltf as write_gltf
+from ._html import write_html as write_html
+from ._inspect import (
+    Inspection as Inspection,
+    fit_garment as fit_garment,
+    inspect_garment as inspect_garment,
+)
+from ._mdd import read_mdd as read_mdd, write_mdd as write_mdd
 from ._obj import ObjMesh as ObjMesh, read_obj as read_obj, write_obj as write_obj
 from ._pc2 import read_pc2 as read_pc2, write_pc2 as write_pc2
 from ._usd import write_usd as write_usd

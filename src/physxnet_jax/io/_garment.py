@@ -5,7 +5,7 @@ import pathlib
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from ..body import Body, load_body
@@ -17,7 +17,7 @@ from ..garment import (
     Template,
     carried_weights,
     clearance,
-    set_clearance,
+    lift_out,
     smoothing_matrix,
     template,
 )
@@ -31,8 +31,8 @@ from ..geometry import (
 )
 from ._obj import ObjMesh, read_obj
 
-_UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
-_NEAREST = 0.003
+UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
+NEAREST = 0.003
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,16 +109,9 @@ def load_garment(
     rest = body.rest_vertices(body.default_shape())
     mesh = body.rest_mesh()
     skin = np.asarray(mesh.vertices)
-    v, unit, up = _place(
-        path, raw.vertices, skin, np.asarray(vertex_normals(mesh.vertices, mesh.faces))
-    )
+    v, unit, up = place_on_body(path, raw.vertices, body)
     distance, _ = clearance(mesh, v)
-    inside = distance < _NEAREST
-    moved = v
-    if inside.any():
-        target = np.full(len(v), _NEAREST)
-        moved = set_clearance(mesh, v, raw.faces, target, free=np.ones(len(v)), iterations=8)
-        moved = np.where((distance < 3 * _NEAREST)[:, None], moved, v)
+    moved, inside = lift_out(mesh, v, raw.faces, NEAREST)
     near = nearby_faces(skin, np.asarray(mesh.faces), moved, neighbours=12)
     points = jnp.asarray(moved.astype(np.float32))
     hit = closest_among(mesh, points, jnp.asarray(near))
@@ -126,7 +119,7 @@ def load_garment(
     foot = jnp.einsum("vk,vkc->vc", hit.weights, rest[refs])
     weights = np.asarray(carried_weights(body.weights, refs, hit.weights))
     weights = _smooth_far(weights, raw, np.sqrt(np.asarray(hit.squared_distance)))
-    kind = _guess(moved, raw) if kind is None else kind
+    kind = guess_template(moved, raw.faces) if kind is None else kind
     pinned = np.zeros(len(v), dtype=bool)
     loops = boundary_loops(raw.faces)
     if kind == "bottom" and loops:
@@ -155,16 +148,23 @@ def load_garment(
     return garment, report
 
 
-def _place(
-    path: pathlib.Path, vertices: np.ndarray, skin: np.ndarray, normals: np.ndarray
+def place_on_body(
+    path: pathlib.Path, vertices: Float[np.ndarray, "vertices 3"], body: Body
 ) -> tuple[Float[np.ndarray, "vertices 3"], str, str]:
-    """The unit and axis that bring the mesh closest to the skin."""
+    """The mesh in metres, by the unit and up axis that bring it closest to the skin.
+
+    Raises:
+        MeshError: None does.
+    """
+    mesh = body.rest_mesh()
+    skin = np.asarray(mesh.vertices)
+    normals = np.asarray(vertex_normals(mesh.vertices, mesh.faces))
     tree = KDTree(skin)
     floor = np.array([0.0, float(skin[:, 1].min()), 0.0])
     best = (np.inf, vertices, "m", "Y")
     for up in ("Y", "Z"):
         turned = vertices if up == "Y" else vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
-        for unit, scale in _UNITS.items():
+        for unit, scale in UNITS.items():
             for shift in (np.zeros(3), floor):
                 v = turned * scale + shift
                 size = np.ptp(v, axis=0).max()
@@ -188,7 +188,9 @@ def _place(
     return v, unit, up
 
 
-def _guess(v: np.ndarray, raw: ObjMesh) -> Template:
+def guess_template(
+    v: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Template:
     """From what it covers: above the waist, below the crotch, one tube or two."""
     upper = float(np.mean(v[:, 1] > 0.15))
     lower = float(np.mean(v[:, 1] < -0.08))
@@ -196,7 +198,7 @@ def _guess(v: np.ndarray, raw: ObjMesh) -> Template:
         return "dress"
     if upper >= lower:
         return "top"
-    low = [x for x in boundary_loops(raw.faces) if v[x, 1].mean() < -0.08 and len(x) > 4]
+    low = [x for x in boundary_loops(faces) if v[x, 1].mean() < -0.08 and len(x) > 4]
     return "bottom" if len(low) >= 2 else "dress"
 
 

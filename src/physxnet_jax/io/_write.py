@@ -8,11 +8,14 @@ import numpy as np
 from ..errors import FormatError
 from ..files import whole_file
 from ._clip import AnimatedMesh
+from ._gltf import write_gltf
+from ._html import write_html
+from ._mdd import write_mdd
 from ._obj import write_obj
 from ._pc2 import write_pc2
 from ._usd import write_usd
 
-EXTENSIONS = (".usdc", ".usd", ".usda", ".pc2", ".npz")
+EXTENSIONS = (".usdc", ".usd", ".usda", ".pc2", ".mdd", ".glb", ".html", ".obj", ".npz")
 
 
 def check_output(path: str | pathlib.Path) -> pathlib.Path:
@@ -34,12 +37,15 @@ def write_clip(
 ) -> list[pathlib.Path]:
     """Writes a clip; returns the files written.
 
-    ``.usdc``, ``.usd``, ``.usda``: one stage. ``.npz``: ``NAME_positions``,
-    ``NAME_faces`` and ``fps``. ``.pc2``: for each mesh a cache and an OBJ of its first
-    frame with the same vertex order, ``STEM_NAME.pc2`` and ``STEM_NAME.obj``.
+    ``.usdc``, ``.usd``, ``.usda``: one stage. ``.glb``: glTF with a morph target a frame.
+    ``.html``: a page that plays it.
+    ``.npz``: ``NAME_positions``, ``NAME_faces`` and ``fps``. ``.pc2``, ``.mdd``: for each
+    mesh a cache and an OBJ of its first frame with the same vertex order, ``STEM_NAME.pc2``
+    and ``STEM_NAME.obj``. ``.obj``: a file for each mesh and frame, ``STEM_NAME_0000.obj``.
 
     Raises:
-        FormatError: Another extension.
+        FormatError: Another extension, or too many frames for glTF.
+        MissingDependencyError: A library that the format needs isn't there.
     """
     path = check_output(path)
     suffix = path.suffix.lower()
@@ -54,10 +60,24 @@ def write_clip(
         with whole_file(path) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
         return [path]
+    if suffix in (".glb", ".html"):
+        write = write_gltf if suffix == ".glb" else write_html
+        write(path, meshes, fps)
+        return [path]
     written = []
     for m in meshes:
-        cache = path.with_name(f"{path.stem}_{m.name}.pc2")
-        write_pc2(cache, m.positions)
+        stem = f"{path.stem}_{m.name}"
+        if suffix == ".obj":
+            for k, x in enumerate(m.positions):
+                frame = path.with_name(f"{stem}_{k:04d}.obj")
+                write_obj(frame, x, m.faces, m.uv, m.uv_faces)
+                written.append(frame)
+            continue
+        cache = path.with_name(f"{stem}{suffix}")
+        if suffix == ".mdd":
+            write_mdd(cache, m.positions, fps)
+        else:
+            write_pc2(cache, m.positions)
         shape = cache.with_suffix(".obj")
         write_obj(shape, m.positions[0], m.faces, m.uv, m.uv_faces)
         written += [cache, shape]

@@ -1,6 +1,10 @@
 """Networks and the predictor built on them. Knows nothing of losses or files."""
 
-from ._blocks import depth_to_space as depth_to_space, upsampling_kernel as upsampling_kernel
+from ._blocks import (
+    Up as Up,
+    depth_to_space as depth_to_space,
+    upsampling_kernel as upsampling_kernel,
+)
 from ._features import (
     PAPER as PAPER,
     Family as Family,

@@ -4,6 +4,7 @@ from ._batches import (
     Frames as Frames,
     batch_indices as batch_indices,
     load_frames as load_frames,
+    take as take,
     usable_garment as usable_garment,
 )
 from ._checkpoint import Checkpoints as Checkpoints

@@ -1,0 +1,74 @@
+"""`physxnet inspect` and `physxnet fit`: garment files, looked at and mended."""
+
+import dataclasses
+import json
+import math
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from ..io import Inspection, fit_garment, inspect_garment
+from ._commands import Fit, Inspect
+
+
+def inspect(command: Inspect, console: Console) -> int:
+    """Shows every file; 1 if one of them needs mending."""
+    found = []
+    for file in command.files:
+        found.append(inspect_garment(file))
+        if not command.json:
+            _show(found[-1], console)
+    if command.json:
+        # One text for machines, whatever the width of the terminal.
+        print(json.dumps([_plain(f) for f in found], indent=1))  # noqa: T201
+    return int(any(f.problems for f in found))
+
+
+def fit(command: Fit, console: Console) -> int:
+    """Mends a file; says what was done and how the result looks."""
+    length = None if command.edge_length is None else 1e-3 * command.edge_length
+    with console.status("fitting"):
+        done, result = fit_garment(command.file, command.out, like=command.like, edge_length=length)
+    for step in done:
+        console.print(step, highlight=False)
+    _show(result, console)
+    console.print(f"wrote {command.out}", highlight=False)
+    return int(bool(result.problems))
+
+
+def _show(found: Inspection, console: Console) -> None:
+    h = found.health
+    unit = "of its own" if found.unit is None else found.unit
+    table = Table(title=str(found.path), title_justify="left", show_header=False)
+    rows: list[tuple[str, str]] = [
+        ("size", " x ".join(f"{s:.4g}" for s in found.size) + f" ({unit})"),
+        ("up axis", found.up or "unknown"),
+        ("vertices, faces", f"{h.vertices:,}, {found.polygons:,} ({h.faces:,} triangles)"),
+        ("parts", str(h.components)),
+        ("texture coordinates", "yes" if h.uv else "no"),
+    ]
+    if found.unit is not None:
+        around = ", ".join(f"{x:.2f}" for x in h.openings[:6])
+        rows += [
+            ("openings", f"{len(h.openings)}: {around} m round" if h.openings else "none"),
+            ("edges", f"{1e3 * h.median_edge:.1f} mm, up to {1e3 * h.longest_edge:.0f} mm"),
+            ("above the skin", f"{1e3 * found.distance:.0f} mm, up to {1e3 * found.farthest:.0f}"),
+            ("inside the body", f"{100 * found.inside:.1f} %"),
+            ("facing outwards", f"{100 * found.outward:.0f} %"),
+            ("dressed by", found.template or "-"),
+            ("rays that bind it", f"{100 * found.hit_rate:.1f} %"),
+        ]
+    for name, value in rows:
+        table.add_row(name, value)
+    console.print(table)
+    for line in found.problems:
+        console.print(f"wrong: {line}", highlight=False, markup=False)
+    for line in found.notes:
+        console.print(f"note:  {line}", highlight=False, markup=False)
+    console.print(found.verdict, highlight=False, markup=False, soft_wrap=True)
+
+
+def _plain(found: Inspection) -> dict[str, Any]:
+    values = dataclasses.asdict(found) | {"path": str(found.path), "verdict": found.verdict}
+    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}

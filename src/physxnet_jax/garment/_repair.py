@@ -1,0 +1,285 @@
+"""Meshes as people have them, made fit for cloth: welded, cleaned, oriented, refined.
+
+Every function keeps texture coordinates with their corners, unless it says otherwise.
+"""
+
+import dataclasses
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import breadth_first_order, connected_components as components
+from scipy.spatial import KDTree
+
+from ..errors import MeshError, MissingDependencyError
+from ..geometry import (
+    TriMesh,
+    boundary_loops,
+    connected_components,
+    make_mesh,
+    manifold_report,
+    mesh_edges,
+)
+from ._fit import clearance
+
+WELD = 1e-4
+"""Vertices nearer than this are taken for one [m]."""
+
+_THIN = 1e-10
+_MOST = 400_000
+
+
+@dataclasses.dataclass(frozen=True)
+class MeshHealth:
+    """What a mesh is like, and what usually goes wrong with it.
+
+    Attributes:
+        vertices: Number of vertices that a face uses.
+        faces: Number of triangles.
+        components: Connected parts.
+        openings: Length of each boundary [m], longest first.
+        non_manifold_edges: Edges with more than two faces.
+        duplicate_faces: Faces that are there more than once.
+        degenerate_faces: Faces without an area.
+        inconsistent_edges: Edges whose faces run in different senses.
+        unused_vertices: Vertices that no face uses.
+        coincident_vertices: Vertices within `WELD` of another one.
+        median_edge: Median length of edges [m].
+        longest_edge: Length of the longest edge [m].
+        uv: Whether there are texture coordinates.
+    """
+
+    vertices: int
+    faces: int
+    components: int
+    openings: tuple[float, ...]
+    non_manifold_edges: int
+    duplicate_faces: int
+    degenerate_faces: int
+    inconsistent_edges: int
+    unused_vertices: int
+    coincident_vertices: int
+    median_edge: float
+    longest_edge: float
+    uv: bool
+
+
+def mesh_health(mesh: TriMesh) -> MeshHealth:
+    """Counts over a mesh in metres."""
+    x, faces = _arrays(mesh)
+    used = np.unique(faces)
+    report = manifold_report(faces)
+    edges = mesh_edges(faces).vertices
+    length = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
+    labels = connected_components(faces, len(x))[used]
+    around = [
+        np.linalg.norm(x[loop] - x[np.roll(loop, 1)], axis=1) for loop in boundary_loops(faces)
+    ]
+    return MeshHealth(
+        len(used),
+        len(faces),
+        len(np.unique(labels)),
+        tuple(sorted((float(a.sum()) for a in around), reverse=True)),
+        report["non_manifold_edges"],
+        report["duplicate_faces"],
+        int((~_has_area(x, faces)).sum()),
+        report["inconsistent_edges"],
+        len(x) - len(used),
+        len(x) - int(_clusters(x, WELD).max(initial=-1)) - 1,
+        float(np.median(length)),
+        float(length.max()),
+        mesh.uv is not None,
+    )
+
+
+def weld(mesh: TriMesh, distance: float = WELD) -> TriMesh:
+    """Vertices within a distance of each other become one, at the first one's place.
+
+    Args:
+        mesh: The mesh.
+        distance: Farthest that welded neighbours may lie apart [m].
+    """
+    x, faces = _arrays(mesh)
+    label = _clusters(x, distance)
+    _, first = np.unique(label, return_index=True)
+    return _remade(mesh, x[first], label[faces])
+
+
+def clean(mesh: TriMesh) -> TriMesh:
+    """Without faces that have no area or are there twice, and without unused vertices."""
+    x, faces = _arrays(mesh)
+    keep = _has_area(x, faces)
+    _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    once = np.zeros(len(faces), dtype=bool)
+    once[first] = True
+    keep &= once
+    if not keep.any():
+        raise MeshError("no face of this mesh has an area: export it again.")
+    uv_faces = None if mesh.uv_faces is None else np.asarray(mesh.uv_faces)[keep]
+    used, corners = np.unique(faces[keep], return_inverse=True)
+    return _remade(mesh, x[used], corners.reshape(-1, 3), uv_faces)
+
+
+def orient(mesh: TriMesh, body: TriMesh) -> TriMesh:
+    """Faces that run in one sense in every part, outwards from the body.
+
+    Args:
+        mesh: A garment on the body.
+        body: The closed body.
+    """
+    x, faces = _arrays(mesh)
+    sense = _senses(faces)
+    turned = np.where(sense[:, None], faces[:, ::-1], faces)
+    corner = x[turned]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    _, away = clearance(body, corner.mean(axis=1).astype(np.float32))
+    part = connected_components(turned, len(x))[turned[:, 0]]
+    outward = np.bincount(part, np.einsum("fi,fi->f", normal, away))
+    flipped = sense ^ (outward < 0)[part]
+    uv_faces = None
+    if mesh.uv_faces is not None:
+        uv_faces = np.asarray(mesh.uv_faces)
+        uv_faces = np.where(flipped[:, None], uv_faces[:, ::-1], uv_faces)
+    out = np.where(flipped[:, None], faces[:, ::-1], faces)
+    return _remade(mesh, x, out, uv_faces)
+
+
+def subdivide(mesh: TriMesh, longest: float) -> TriMesh:
+    """Edges split in the middle until none is longer than a length [m]; no other is touched.
+
+    Raises:
+        MeshError: It would take more than 400,000 vertices.
+    """
+    x, faces = _arrays(mesh)
+    uv = None if mesh.uv is None else np.asarray(mesh.uv, np.float64)
+    chart = None if mesh.uv_faces is None else np.asarray(mesh.uv_faces, np.int64)
+    while True:
+        edges = mesh_edges(faces)
+        length = np.linalg.norm(x[edges.vertices[:, 0]] - x[edges.vertices[:, 1]], axis=1)
+        long = length > longest
+        if not long.any():
+            return make_mesh(x, faces, uv, chart)
+        if len(x) + int(long.sum()) > _MOST:
+            raise MeshError(
+                f"edges of {1e3 * longest:g} mm would take over {_MOST:,} vertices: the longest"
+                f" is {1e3 * length.max():.0f} mm. Choose a longer one."
+            )
+        split = long[edges.of_face]
+        if uv is not None and chart is not None:
+            uv, chart = _split(uv, chart, split)
+        x, faces = _split(x, faces, split)
+
+
+def _split(
+    x: Float[np.ndarray, "points d"],
+    faces: Int[np.ndarray, "faces 3"],
+    split: Bool[np.ndarray, "faces 3"],
+) -> tuple[Float[np.ndarray, "more d"], Int[np.ndarray, "finer 3"]]:
+    """Triangles cut at the middles of chosen edges, each opposite to its corner."""
+    edges = mesh_edges(faces)
+    chosen = np.zeros(len(edges.vertices), dtype=bool)
+    chosen[edges.of_face[split]] = True
+    number = np.full(len(chosen), -1)
+    number[chosen] = len(x) + np.arange(chosen.sum())
+    x = np.concatenate([x, x[edges.vertices[chosen]].mean(axis=1)])
+    middle = number[edges.of_face]
+    out = [faces[~split.any(axis=1)]]
+    for k in range(3):
+        # Corner k first; p and q follow, and m_k lies between p and q.
+        turn = (k + np.arange(3)) % 3
+        c, p, q = faces[:, turn].T
+        mc, mp, mq = middle[:, turn].T
+        one = split[:, turn[0]] & ~split[:, turn[1]] & ~split[:, turn[2]]
+        out += [np.stack(t, 1)[one] for t in ((c, p, mc), (c, mc, q))]
+        two = ~split[:, turn[0]] & split[:, turn[1]] & split[:, turn[2]]
+        out += [np.stack(t, 1)[two] for t in ((c, mq, mp), (mq, p, q), (mq, q, mp))]
+    every = split.all(axis=1)
+    (a, b, c), (ma, mb, mc) = faces[every].T, middle[every].T
+    out += [np.stack(t, 1) for t in ((a, mc, mb), (mc, b, ma), (mb, ma, c), (ma, mb, mc))]
+    return x, np.concatenate(out)
+
+
+def decimate(mesh: TriMesh, edge: float) -> TriMesh:
+    """About as few faces as equilateral ones of an edge length [m] would be.
+
+    Texture coordinates are dropped.
+
+    Raises:
+        MissingDependencyError: Without fast-simplification.
+    """
+    x, faces = _arrays(mesh)
+    area = float(trimesh.Trimesh(x, faces, process=False).area)
+    wanted = max(int(area / (np.sqrt(3.0) / 4.0 * edge**2)), 4)
+    if wanted >= len(faces):
+        return mesh
+    try:
+        import fast_simplification
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Decimating needs fast-simplification: pip install 'physxnet-jax[mesh]'."
+        ) from error
+    found = fast_simplification.simplify(x, faces, target_count=wanted)
+    return make_mesh(found[0], found[1])
+
+
+def _arrays(
+    mesh: TriMesh,
+) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
+    return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+
+
+def _remade(
+    mesh: TriMesh, x: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None = None
+) -> TriMesh:
+    """A mesh whose corners still have their texture coordinates."""
+    if uv_faces is None and mesh.uv_faces is not None:
+        uv_faces = np.asarray(mesh.uv_faces)
+    uv = None if mesh.uv is None else np.asarray(mesh.uv)
+    return make_mesh(x, faces, uv, uv_faces)
+
+
+def _clusters(x: Float[np.ndarray, "vertices 3"], distance: float) -> Int[np.ndarray, " vertices"]:
+    """A number for each vertex, the same for those that are linked; in order of the first."""
+    pairs = KDTree(x).query_pairs(distance, output_type="ndarray")
+    ones = np.ones(len(pairs), dtype=np.int8)
+    graph = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (len(x), len(x)))
+    label = components(graph, directed=False)[1]
+    _, first, number = np.unique(label, return_index=True, return_inverse=True)
+    return np.argsort(np.argsort(first))[number]
+
+
+def _has_area(
+    x: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Bool[np.ndarray, " faces"]:
+    a, b, c = (x[faces[:, k]] for k in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) > 2 * _THIN
+
+
+def _senses(faces: Int[np.ndarray, "faces 3"]) -> Bool[np.ndarray, " faces"]:
+    """Faces to turn round so that neighbours run in one sense, the first of a part as it is."""
+    edges = mesh_edges(faces)
+    two = np.flatnonzero(edges.count == 2)
+    pairs = edges.faces[two].astype(np.int64)
+    # Neighbours agree where they pass their common edge in opposite directions.
+    passes = [
+        (faces[pairs[:, side]] == edges.vertices[two, :1]).argmax(axis=1) for side in range(2)
+    ]
+    after = [
+        faces[pairs[:, side], (passes[side] + 1) % 3] == edges.vertices[two, 1] for side in range(2)
+    ]
+    differ = after[0] == after[1]
+    count = len(faces)
+    graph = coo_matrix((np.ones(len(two), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
+    sense = np.zeros(count, dtype=bool)
+    keys = np.concatenate([pairs[:, 0] * count + pairs[:, 1], pairs[:, 1] * count + pairs[:, 0]])
+    order = np.argsort(keys)
+    keys, differ = keys[order], np.concatenate([differ, differ])[order]
+    parts = components(graph, directed=False)[1]
+    for start in np.unique(parts, return_index=True)[1]:
+        walk, before = breadth_first_order(graph, start, directed=False)
+        steps = walk[1:]
+        turn = differ[np.searchsorted(keys, before[steps].astype(np.int64) * count + steps)]
+        for face, turned in zip(steps, turn, strict=True):
+            sense[face] = sense[before[face]] ^ turned
+    return sense

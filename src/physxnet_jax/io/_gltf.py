@@ -1,0 +1,165 @@
+"""Animated glTF: a morph target for each frame. For short clips, in browsers and engines."""
+
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Int
+
+from ..errors import FormatError, MissingDependencyError
+from ..files import whole_file
+from ._clip import AnimatedMesh, smooth_normals
+
+MAX_FRAMES = 300
+"""Frames that a glTF takes: each is stored whole, and viewers hold all in memory."""
+
+
+def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
+    """Writes meshes as one binary glTF, playing in a loop in most viewers.
+
+    Frame 0 is the mesh, every other frame a morph target with positions and normals;
+    one animation goes through them, linear between frames. Where texture coordinates
+    part at a seam the vertex is doubled, as glTF asks: the first vertices stay in order
+    only for meshes without ``uv``.
+
+    Args:
+        path: ``.glb``; written whole or not at all.
+        meshes: What to write; all of the same number of frames.
+        fps: Frames a second.
+
+    Raises:
+        FormatError: More than `MAX_FRAMES` frames.
+        MissingDependencyError: Without pygltflib.
+
+    References:
+        Khronos, glTF 2.0, sections 3.7.2.2 (morph targets) and 3.11 (animations).
+    """
+    frames = len(meshes[0].positions)
+    if frames > MAX_FRAMES:
+        raise FormatError(
+            f"{path}: {frames} frames are too many for glTF, which takes {MAX_FRAMES}: write"
+            " .usdc or .pc2, or fewer frames (--frames)."
+        )
+    try:
+        import pygltflib
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Writing glTF needs pygltflib: pip install 'physxnet-jax[gltf]'."
+        ) from error
+    file = _Builder(pygltflib)
+    for m in meshes:
+        file.add(m)
+    file.animate(frames, fps)
+    with whole_file(path) as part, part.open("wb") as target:
+        target.write(b"".join(file.document().save_to_bytes()))
+
+
+class _Builder:
+    """A glTF document and its one buffer while they grow."""
+
+    def __init__(self, library) -> None:
+        self.lib = library
+        self.gltf = library.GLTF2(
+            asset=library.Asset(version="2.0", generator="physxnet_jax"),
+            scene=0,
+            scenes=[library.Scene(nodes=[])],
+        )
+        self.blob = bytearray()
+
+    def add(self, m: AnimatedMesh) -> None:
+        lib, gltf = self.lib, self.gltf
+        rows, faces, uv = _split_at_seams(m)
+        x = m.positions[:, rows].astype(np.float32)
+        n = smooth_normals(m.positions, m.faces)[:, rows]
+        attributes = {"POSITION": self.store(x[0], "VEC3"), "NORMAL": self.store(n[0], "VEC3")}
+        if uv is not None:
+            # Images begin at the top in glTF.
+            attributes["TEXCOORD_0"] = self.store(uv * [1, -1] + [0, 1], "VEC2")
+        targets = [
+            {
+                "POSITION": self.store(x[k] - x[0], "VEC3"),
+                "NORMAL": self.store(n[k] - n[0], "VEC3"),
+            }
+            for k in range(1, len(x))
+        ]
+        gltf.materials.append(
+            lib.Material(
+                name=m.name,
+                doubleSided=True,
+                pbrMetallicRoughness=lib.PbrMetallicRoughness(
+                    baseColorFactor=[*map(float, m.colour), 1.0],
+                    metallicFactor=0.0,
+                    roughnessFactor=0.8,
+                ),
+            )
+        )
+        primitive = lib.Primitive(
+            attributes=lib.Attributes(**attributes),
+            indices=self.store(faces.reshape(-1).astype(np.uint32), "SCALAR", index=True),
+            material=len(gltf.materials) - 1,
+            targets=targets,
+        )
+        gltf.meshes.append(
+            lib.Mesh(name=m.name, primitives=[primitive], weights=[0.0] * len(targets))
+        )
+        gltf.nodes.append(lib.Node(name=m.name, mesh=len(gltf.meshes) - 1))
+        gltf.scenes[0].nodes.append(len(gltf.nodes) - 1)
+
+    def animate(self, frames: int, fps: float) -> None:
+        if frames < 2:
+            return
+        lib = self.lib
+        times = self.store((np.arange(frames) / fps).astype(np.float32), "SCALAR")
+        weights = self.store(np.eye(frames, dtype=np.float32)[:, 1:].reshape(-1), "SCALAR")
+        self.gltf.animations.append(
+            lib.Animation(
+                name="clip",
+                samplers=[
+                    lib.AnimationSampler(input=times, output=weights, interpolation="LINEAR")
+                ],
+                channels=[
+                    lib.AnimationChannel(
+                        sampler=0, target=lib.AnimationChannelTarget(node=k, path="weights")
+                    )
+                    for k in range(len(self.gltf.nodes))
+                ],
+            )
+        )
+
+    def store(self, values: np.ndarray, kind: str, *, index: bool = False) -> int:
+        """An accessor for an array; its number."""
+        lib, gltf = self.lib, self.gltf
+        values = np.ascontiguousarray(values, np.uint32 if index else np.float32)
+        blob = values.tobytes()
+        gltf.bufferViews.append(
+            lib.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=len(blob))
+        )
+        self.blob += blob
+        rows = values.reshape(len(values), -1)
+        gltf.accessors.append(
+            lib.Accessor(
+                bufferView=len(gltf.bufferViews) - 1,
+                componentType=lib.UNSIGNED_INT if index else lib.FLOAT,
+                count=len(values),
+                type=kind,
+                min=rows.min(axis=0).tolist(),
+                max=rows.max(axis=0).tolist(),
+            )
+        )
+        return len(gltf.accessors) - 1
+
+    def document(self):
+        self.gltf.buffers.append(self.lib.Buffer(byteLength=len(self.blob)))
+        self.gltf.set_binary_blob(bytes(self.blob))
+        return self.gltf
+
+
+def _split_at_seams(
+    m: AnimatedMesh,
+) -> tuple[Int[np.ndarray, " points"], Int[np.ndarray, "faces 3"], np.ndarray | None]:
+    """Rows of the mesh's vertices, triangles over them and their texture coordinates."""
+    if m.uv is None or m.uv_faces is None:
+        return np.arange(m.positions.shape[1]), m.faces, None
+    corners = np.stack([m.faces.reshape(-1), m.uv_faces.reshape(-1)], axis=1)
+    pairs, index = np.unique(corners, axis=0, return_inverse=True)
+    return pairs[:, 0], index.reshape(-1, 3), m.uv[pairs[:, 1]]

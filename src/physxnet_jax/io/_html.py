@@ -1,0 +1,151 @@
+"""A page that shows a clip by itself: a glTF and a viewer for it in one file."""
+
+import base64
+import html
+import json
+import pathlib
+import tempfile
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..files import whole_file
+from ._clip import AnimatedMesh
+from ._gltf import write_gltf
+
+_VIEWER = pathlib.Path(__file__).with_name("assets") / "model-viewer.min.js"
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>__TITLE__</title>
+<style>
+html, body { height: 100%; margin: 0; font: 15px system-ui, sans-serif; background: #f4f4f2; }
+body { display: flex; flex-direction: column; }
+model-viewer { flex: 1; width: 100%; --poster-color: transparent; }
+form { display: flex; flex-wrap: wrap; gap: 1em; align-items: center; padding: .6em 1em; }
+input[type=range] { flex: 1; min-width: 10em; }
+output { min-width: 9em; font-variant-numeric: tabular-nums; }
+button { min-width: 5em; }
+</style>
+<script type="module">__VIEWER__</script>
+</head>
+<body>
+<model-viewer id="view" camera-controls autoplay interaction-prompt="none" shadow-intensity="0.6"
+ tone-mapping="neutral" exposure="0.85" camera-orbit="25deg 80deg __AWAY__m"
+ camera-target="__MIDDLE__" field-of-view="30deg" max-camera-orbit="auto auto __FARTHEST__m"
+ alt="__TITLE__"></model-viewer>
+<form onsubmit="return false">
+<button type="button" id="play">pause</button>
+<input type="range" id="time" min="0" max="__LAST__" value="0" step="1" aria-label="frame">
+<output id="shown"></output>
+<span id="parts"></span>
+</form>
+<script id="told" type="application/json">__TOLD__</script>
+<script type="module">
+const told = JSON.parse(document.getElementById('told').textContent);
+const [view, play, time, shown, parts] =
+  ['view', 'play', 'time', 'shown', 'parts'].map(id => document.getElementById(id));
+const bytes = Uint8Array.from(atob(told.model), c => c.charCodeAt(0));
+view.src = URL.createObjectURL(new Blob([bytes], {type: 'model/gltf-binary'}));
+const last = told.frames - 1;
+const tell = frame => {
+  time.value = frame;
+  shown.textContent = `frame ${frame} of ${last}, ${(frame / told.fps).toFixed(2)} s`;
+};
+const stop = frame => {
+  view.pause();
+  play.textContent = 'play';
+  // The very end would wrap to the start.
+  view.currentTime = Math.min(frame / told.fps, Math.max(last / told.fps - 1e-4, 0));
+  tell(frame);
+};
+const wear = (name, worn) => {
+  const material = view.model.materials.find(m => m.name === name);
+  const rgba = [...told.meshes[name], worn ? 1 : 0];
+  material.setAlphaMode(worn ? 'OPAQUE' : 'MASK');
+  material.pbrMetallicRoughness.setBaseColorFactor(rgba);
+};
+view.addEventListener('load', () => {
+  for (const name of Object.keys(told.meshes)) {
+    const label = document.createElement('label');
+    const box = Object.assign(document.createElement('input'), {type: 'checkbox', checked: true});
+    box.addEventListener('change', () => wear(name, box.checked));
+    label.append(box, ' ', name);
+    parts.append(label);
+  }
+  // page.html#frame=12&without=top opens at a frame, without a mesh.
+  const asked = new URLSearchParams(location.hash.slice(1));
+  for (const name of asked.getAll('without')) {
+    if (!(name in told.meshes)) continue;
+    wear(name, false);
+    parts.children[Object.keys(told.meshes).indexOf(name)].firstChild.checked = false;
+  }
+  if (asked.has('frame')) stop(Math.min(Math.max(Math.round(+asked.get('frame')) || 0, 0), last));
+  document.body.dataset.state = 'loaded';
+});
+view.addEventListener('error', e => { shown.textContent = `can't be shown: ${e.detail.type}`; });
+play.addEventListener('click', () => {
+  if (view.paused) { view.play(); play.textContent = 'pause'; }
+  else stop(Math.round(view.currentTime * told.fps) % told.frames);
+});
+time.addEventListener('input', () => stop(+time.value));
+const follow = () => {
+  if (!view.paused && last > 0) tell(Math.round(view.currentTime * told.fps) % told.frames);
+  requestAnimationFrame(follow);
+};
+tell(0);
+follow();
+</script>
+</body>
+</html>
+"""
+
+
+def write_html(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
+    """Writes a page that plays the clip in any browser, without a network.
+
+    Orbit with the mouse; play, stop and scrub; every mesh can be hidden. The address
+    ``page.html#frame=12&without=top`` opens at a frame, without a mesh. What limits
+    `write_gltf` limits this too.
+
+    Args:
+        path: ``.html``; written whole or not at all.
+        meshes: What to show; all of the same number of frames.
+        fps: Frames a second.
+
+    Raises:
+        FormatError: Too many frames.
+        MissingDependencyError: Without pygltflib.
+    """
+    path = pathlib.Path(path)
+    with tempfile.TemporaryDirectory(prefix="physxnet_") as folder:
+        model = pathlib.Path(folder) / "clip.glb"
+        write_gltf(model, meshes, fps)
+        told = {
+            "frames": len(meshes[0].positions),
+            "fps": fps,
+            "meshes": {m.name: list(map(float, m.colour)) for m in meshes},
+            "model": base64.b64encode(model.read_bytes()).decode(),
+        }
+    # The whole clip stays in sight: its ball fills the view of 30 degrees.
+    low = np.min([m.positions.min(axis=(0, 1)) for m in meshes], axis=0)
+    high = np.max([m.positions.max(axis=(0, 1)) for m in meshes], axis=0)
+    away = float(np.linalg.norm(high - low)) * 0.5 / np.sin(np.radians(15.0))
+    parts = {
+        "__AWAY__": f"{away:.3f}",
+        "__FARTHEST__": f"{3 * away:.3f}",
+        "__MIDDLE__": " ".join(f"{x:.3f}m" for x in (low + high) / 2),
+        "__TITLE__": html.escape(path.stem),
+        "__LAST__": str(told["frames"] - 1),
+        # Neither text may close the element that holds it.
+        "__TOLD__": json.dumps(told).replace("<", "\\u003c"),
+        "__VIEWER__": _VIEWER.read_text(encoding="utf-8").replace("</script", "<\\/script"),
+    }
+    page = _PAGE
+    for name, text in parts.items():
+        page = page.replace(name, text)
+    with whole_file(path) as part:
+        part.write_text(page, encoding="utf-8")

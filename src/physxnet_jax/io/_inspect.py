@@ -1,0 +1,280 @@
+"""What a garment file is like, what is wrong with it, and the same made wearable."""
+
+import dataclasses
+import pathlib
+import shlex
+
+import numpy as np
+
+from ..body import Body, load_body
+from ..errors import MeshError
+from ..garment import (
+    Garment,
+    MeshHealth,
+    Template,
+    clean,
+    clearance,
+    decimate,
+    lift_out,
+    mesh_health,
+    orient,
+    subdivide,
+    template,
+    weld,
+)
+from ..geometry import TriMesh, make_mesh
+from ..uv import bind, garment_map_rows, make_atlas
+from ._garment import NEAREST, load_garment, place_on_body
+from ._obj import read_obj, write_obj
+
+# Shares and lengths beyond which a garment is worth a word [1], [m].
+_INSIDE, _LONG, _FINE, _MISSED = 0.02, 0.04, 0.003, 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Inspection:
+    """What was found out about a garment file.
+
+    Attributes:
+        path: The file.
+        unit: Its unit, or None if no unit and axis puts it on the body.
+        up: Its up axis, likewise.
+        size: What it measures along its own axes, in its own unit.
+        health: What the mesh is like, in metres (in its own unit without one).
+        polygons: Faces before they were cut into triangles.
+        distance: Median distance to the skin [m].
+        farthest: Largest distance to the skin [m].
+        inside: Share of vertices inside the body or within 3 mm of it.
+        outward: Share of faces that look away from the body.
+        template: The template that dresses it.
+        hit_rate: Share of vertices whose ray meets the body.
+        problems: What is wrong, a sentence each; what can't be mended first.
+        notes: What is good to know but harms nothing.
+        command: The command that mends it; None if nothing has to be.
+    """
+
+    path: pathlib.Path
+    unit: str | None
+    up: str | None
+    size: tuple[float, ...]
+    health: MeshHealth
+    polygons: int
+    distance: float
+    farthest: float
+    inside: float
+    outward: float
+    template: Template | None
+    hit_rate: float
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+    command: str | None
+
+    @property
+    def verdict(self) -> str:
+        """``ready``, or what to do."""
+        if not self.problems:
+            return "ready: it can be worn as it is."
+        return f"mend it first: {self.command}"
+
+
+def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> Inspection:
+    """Looks at a garment file and changes nothing.
+
+    Args:
+        path: An ``.obj`` file.
+        body: The body; the built-in one by default.
+
+    Raises:
+        FormatError: A file that can't be read.
+    """
+    path = pathlib.Path(path)
+    body = load_body() if body is None else body
+    raw = read_obj(path)
+    size = tuple(float(s) for s in np.ptp(raw.vertices, axis=0))
+    problems, notes, options = [], [], []
+    try:
+        v, unit, up = place_on_body(path, raw.vertices, body)
+    except MeshError as error:
+        problems.append(str(error).partition(": ")[2])
+        options.append("--like top")
+        health = mesh_health(make_mesh(raw.vertices, raw.faces, raw.uv, raw.uv_faces))
+        nan = float("nan")
+        command = _command(path, options)
+        return Inspection(
+            path, None, None, size, health, raw.polygons, nan, nan, nan, nan, None, nan,
+            tuple(problems), (), command,
+        )  # fmt: skip
+    mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
+    health = mesh_health(mesh)
+    skin = body.rest_mesh()
+    distance, _ = clearance(skin, np.asarray(v, np.float32))
+    inside = float(np.mean(distance < NEAREST))
+    corner = np.asarray(v)[raw.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    _, away = clearance(skin, corner.mean(axis=1).astype(np.float32))
+    outward = float(np.mean(np.einsum("fi,fi->f", normal, away) > 0))
+    garment, _ = load_garment(path, body=body)
+    hit_rate = _hit_rate(body, garment)
+    counts = (
+        (health.coincident_vertices, "vertices that coincide with another one: cloth tears there"),
+        (health.degenerate_faces, "faces without an area"),
+        (health.duplicate_faces, "faces that are there twice"),
+        (health.unused_vertices, "vertices that no face uses"),
+        (health.inconsistent_edges, "edges whose faces run in different senses"),
+    )
+    problems += [f"{n:,} {what}." for n, what in counts if n]
+    if outward < 0.5:
+        problems.append(f"its faces look inwards ({100 * outward:.0f} % look away from the body).")
+    if health.non_manifold_edges:
+        notes.append(
+            f"{health.non_manifold_edges:,} edges have more than two faces; they are kept, and bend"
+            " as several hinges."
+        )
+    if inside > _INSIDE:
+        problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
+    if health.longest_edge > _LONG:
+        problems.append(
+            f"edges up to {1e3 * health.longest_edge:.0f} mm: too long to fold, and they cut"
+            " corners off limbs."
+        )
+        options.append("--edge-length 20")
+    elif health.median_edge < _FINE:
+        notes.append(
+            f"edges of {1e3 * health.median_edge:.1f} mm: finer than any map here; --edge-length 8"
+            " would make it quicker."
+        )
+    if health.components > 1:
+        notes.append(f"{health.components} parts that nothing joins: each moves by itself.")
+    if hit_rate < 1 - _MISSED:
+        notes.append(
+            f"{100 * (1 - hit_rate):.0f} % of the vertices' rays miss the body; they are bound to"
+            " the closest skin."
+        )
+    return Inspection(
+        path, unit, up, size, health, raw.polygons, float(np.median(np.abs(distance))),
+        float(distance.max()), inside, outward, garment.template, hit_rate, tuple(problems),
+        tuple(notes), _command(path, options) if problems else None,
+    )  # fmt: skip
+
+
+def fit_garment(
+    path: str | pathlib.Path,
+    out: str | pathlib.Path,
+    *,
+    like: Template | None = None,
+    edge_length: float | None = None,
+    body: Body | None = None,
+) -> tuple[list[str], Inspection]:
+    """Writes a garment that can be worn: on the body, clean, oriented and out of the skin.
+
+    Args:
+        path: An ``.obj`` file.
+        out: The ``.obj`` to write: metres, Y up, on the body at rest.
+        like: Scale and move it onto this template's place instead of guessing its unit.
+        edge_length: Split edges longer than this; where most are shorter than half of it,
+            decimate to it [m].
+        body: The body; the built-in one by default.
+
+    Returns:
+        What was done, a sentence each, and how the result looks.
+
+    Raises:
+        FormatError: A file that can't be read.
+        MeshError: No unit and axis puts it on the body, and ``like`` isn't given.
+        MissingDependencyError: Decimation without fast-simplification.
+    """
+    path, out = pathlib.Path(path), pathlib.Path(out)
+    if out.suffix.lower() != ".obj":
+        raise MeshError(f"{out}: garments are written as .obj.")
+    body = load_body() if body is None else body
+    raw = read_obj(path)
+    skin = body.rest_mesh()
+    done = []
+    if like is None:
+        v, unit, up = place_on_body(path, raw.vertices, body)
+        done.append(f"read as {unit}, {up} up.")
+    else:
+        v, told = _like(raw.vertices, template(like), skin)
+        done.append(told)
+    mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
+    before = mesh_health(mesh)
+    if before.coincident_vertices:
+        mesh = weld(mesh)
+        done.append(f"welded {before.coincident_vertices:,} vertices onto their neighbours.")
+    faces, vertices = int(mesh.faces.shape[0]), int(mesh.vertices.shape[0])
+    mesh = clean(mesh)
+    gone = faces - int(mesh.faces.shape[0]), vertices - int(mesh.vertices.shape[0])
+    if any(gone):
+        done.append(f"removed {gone[0]:,} faces and {gone[1]:,} vertices.")
+    turned = orient(mesh, skin)
+    count = int(np.sum(np.any(np.asarray(turned.faces) != np.asarray(mesh.faces), axis=1)))
+    if count:
+        done.append(f"turned {count:,} faces round.")
+    mesh = turned
+    if edge_length is not None:
+        mesh, told = _resized(mesh, edge_length)
+        done += told
+    moved, low = lift_out(
+        skin, np.asarray(mesh.vertices), np.asarray(mesh.faces), NEAREST, iterations=12
+    )
+    if low.any():
+        done.append(f"moved {int(low.sum()):,} vertices out of the body.")
+    write_obj(
+        out,
+        moved,
+        np.asarray(mesh.faces),
+        None if mesh.uv is None else np.asarray(mesh.uv),
+        None if mesh.uv_faces is None else np.asarray(mesh.uv_faces),
+    )
+    return done, inspect_garment(out, body=body)
+
+
+def _resized(mesh: TriMesh, edge_length: float) -> tuple[TriMesh, list[str]]:
+    health = mesh_health(mesh)
+    if health.median_edge < 0.5 * edge_length:
+        small = decimate(mesh, edge_length)
+        lost = ", without its texture coordinates" if mesh.uv is not None else ""
+        return small, [f"decimated {health.faces:,} faces to {small.faces.shape[0]:,}{lost}."]
+    if health.longest_edge > edge_length:
+        fine = subdivide(mesh, edge_length)
+        return fine, [f"split {health.faces:,} faces into {fine.faces.shape[0]:,}."]
+    return mesh, []
+
+
+def _like(vertices: np.ndarray, wanted: Garment, skin: TriMesh) -> tuple[np.ndarray, str]:
+    """The mesh scaled and moved onto a template's box, whichever axis of it is up."""
+    x = np.asarray(wanted.mesh.vertices, np.float64)
+    low, high = x.min(axis=0), x.max(axis=0)
+    best = (np.inf, vertices, "")
+    for up, turned in (
+        ("Y", vertices),
+        ("Z", vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]),
+    ):
+        size = np.ptp(turned, axis=0)
+        if not size[1] > 0:
+            continue
+        scale = float((high - low)[1] / size[1])
+        middle = turned.min(axis=0) + 0.5 * size
+        v = (turned - middle) * scale + 0.5 * (low + high)
+        distance, _ = clearance(skin, v.astype(np.float32))
+        score = float(np.mean(np.abs(distance)))
+        if score < best[0]:
+            best = (
+                score,
+                v,
+                f"scaled by {scale:.4g}, {up} up, moved to where a {wanted.template} is.",
+            )
+    return best[1], best[2]
+
+
+def _hit_rate(body: Body, garment: Garment) -> float:
+    rest = body.rest_vertices(body.default_shape())
+    atlas = make_atlas(32)
+    valid = garment_map_rows(atlas, body, rest, template(garment.template)).valid
+    return bind(atlas, body, rest, garment, valid).hit_rate
+
+
+def _command(path: pathlib.Path, options: list[str]) -> str:
+    out = path.with_name(f"{path.stem}_fitted.obj")
+    words = ["physxnet", "fit", shlex.quote(str(path)), *options, "-o", shlex.quote(str(out))]
+    return " ".join(words)

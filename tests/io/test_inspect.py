@@ -1,0 +1,140 @@
+"""Files that users have: wrong units, torn, inside out, in the body; seen and mended."""
+
+import json
+import pathlib
+
+import numpy as np
+import pytest
+
+from physxnet_jax.cli import main
+from physxnet_jax.dressing import dress
+from physxnet_jax.errors import FormatError, MeshError
+from physxnet_jax.garment import decimate, template
+from physxnet_jax.geometry import make_mesh
+from physxnet_jax.io import fit_garment, inspect_garment, read_obj, write_obj
+
+
+@pytest.fixture(scope="module")
+def trousers():
+    g = template("bottom")
+    return np.asarray(g.mesh.vertices, float), np.asarray(g.mesh.faces)
+
+
+def saved(folder: pathlib.Path, name: str, vertices, faces, uv=None, uv_faces=None) -> pathlib.Path:
+    path = folder / name
+    write_obj(path, vertices, faces, uv, uv_faces)
+    return path
+
+
+def test_a_good_garment_is_ready(tmp_path, trousers):
+    found = inspect_garment(saved(tmp_path, "a.obj", *trousers))
+    assert (found.unit, found.up, found.template) == ("m", "Y", "bottom")
+    assert found.problems == () and found.command is None and found.verdict.startswith("ready")
+    assert found.health.components == 1 and len(found.health.openings) == 3
+    assert found.hit_rate > 0.95 and found.outward > 0.95 and found.inside < 0.02
+
+
+def test_everything_at_once_is_found_and_mended(tmp_path, trousers):
+    v, faces = trousers
+    alone = np.arange(faces.size).reshape(-1, 3)
+    torn = v[faces.ravel()]
+    # Centimetres, Z up, every triangle by itself, a third of them inside out, one twice.
+    turned = np.where(np.arange(len(faces))[:, None] % 3 == 0, alone[:, ::-1], alone)
+    turned = np.concatenate([turned, turned[:1]])
+    z_up = 100.0 * (torn * [1.0, 1.0, -1.0])[:, [0, 2, 1]]
+    path = saved(tmp_path, "sick.obj", z_up, turned)
+    found = inspect_garment(path)
+    assert (found.unit, found.up) == ("cm", "Z")
+    told = " ".join(found.problems)
+    for word in ("coincide", "twice", "cloth tears"):
+        assert word in told
+    out = tmp_path / "well.obj"
+    assert found.command == f"physxnet fit {path} -o {tmp_path / 'sick_fitted.obj'}"
+    done, after = fit_garment(path, out)
+    assert after.problems == () and after.unit == "m" and after.health.components == 1
+    assert any("welded" in d for d in done) and any("turned" in d for d in done)
+    mended = read_obj(out)
+    assert len(mended.vertices) == len(v)
+    assert path.read_text() != out.read_text(), "the file itself isn't changed"
+
+
+def test_what_is_worn_after_fitting_is_what_the_template_wears(tmp_path, trousers):
+    v, faces = trousers
+    path = saved(tmp_path, "inch.obj", v / 0.0254, faces)
+    fit_garment(path, tmp_path / "m.obj")
+    worn = dress("walk", [str(tmp_path / "m.obj")], method="lbs", frames=3, include_body=False)
+    same = dress("walk", [str(path)], method="lbs", frames=3, include_body=False)
+    np.testing.assert_allclose(worn.garments[0].positions, same.garments[0].positions, atol=2e-4)
+
+
+def test_cloth_in_the_body_is_moved_out(tmp_path, trousers):
+    v, faces = trousers
+    thin = v * [0.9, 1.0, 0.9]
+    found = inspect_garment(saved(tmp_path, "thin.obj", thin, faces))
+    assert found.inside > 0.05 and "in the body" in " ".join(found.problems)
+    _, after = fit_garment(tmp_path / "thin.obj", tmp_path / "out.obj")
+    assert after.inside < 0.25 * found.inside
+
+
+def test_a_mesh_that_is_nowhere_is_put_in_its_place(tmp_path, trousers):
+    v, faces = trousers
+    path = saved(tmp_path, "far.obj", 7.3 * v + [40.0, -3.0, 9.0], faces)
+    found = inspect_garment(path)
+    assert found.unit is None and "--like" in str(found.command)
+    with pytest.raises(MeshError, match="no unit"):
+        fit_garment(path, tmp_path / "out.obj")
+    done, after = fit_garment(path, tmp_path / "out.obj", like="bottom")
+    assert "scaled by 0.137" in done[0] and after.template == "bottom"
+    mended = read_obj(tmp_path / "out.obj").vertices
+    assert np.percentile(np.linalg.norm(mended - v, axis=1), 90) < 0.005
+
+
+def test_edges_become_as_long_as_asked(tmp_path, trousers):
+    pytest.importorskip("fast_simplification")
+    small = decimate(make_mesh(*trousers), 0.04)
+    saved(tmp_path, "coarse.obj", np.asarray(small.vertices), np.asarray(small.faces))
+    done, fine = fit_garment(tmp_path / "coarse.obj", tmp_path / "fine.obj", edge_length=0.025)
+    assert small.faces.shape[0] < 0.6 * len(trousers[1]) and "split" in " ".join(done)
+    assert fine.health.longest_edge < 0.03 and fine.health.components == 1
+
+
+def test_the_commands_say_it_too(tmp_path, trousers, capsys):
+    good, bad = (
+        saved(tmp_path, "good.obj", *trousers),
+        saved(tmp_path, "bad.obj", trousers[0], trousers[1][:, ::-1]),
+    )
+    assert main(["inspect", str(good)]) == 0
+    assert "ready" in capsys.readouterr().out
+    assert main(["inspect", str(good), str(bad), "--json"]) == 1
+    rows = json.loads(capsys.readouterr().out)
+    assert [r["command"] is None for r in rows] == [True, False]
+    assert "look inwards" in " ".join(rows[1]["problems"])
+    # The command it names does what it says.
+    assert main([*rows[1]["command"].split()[1:]]) == 0
+    assert "turned 5,376 faces round" in capsys.readouterr().out.replace(
+        f"{len(trousers[1]):,}", "5,376"
+    )
+    assert main(["inspect", str(tmp_path / "bad_fitted.obj")]) == 0
+    capsys.readouterr()
+    assert main(["inspect", str(tmp_path / "none.obj")]) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert main(["fit", str(good), "-o", str(tmp_path / "a.stl")]) == 2
+
+
+@pytest.mark.parametrize("text", ["", "v 0 0 0\n", "v 0 0 0\nv 1 0 0\nv 0 1 nan\nf 1 2 3\n"])
+def test_broken_files_are_refused(tmp_path, text):
+    path = tmp_path / "x.obj"
+    path.write_text(text)
+    with pytest.raises(FormatError):
+        inspect_garment(path)
+    with pytest.raises(FormatError):
+        fit_garment(path, tmp_path / "out.obj")
+    assert not (tmp_path / "out.obj").exists()
+
+
+def test_a_real_garment_is_inspected(data_dir):
+    """Decimetres; torn nowhere, but some of it lies in our body."""
+    found = inspect_garment(data_dir / "garments" / "tee.obj")
+    assert (found.unit, found.up, found.template) == ("dm", "Y", "top")
+    assert found.health.components == 1 and len(found.health.openings) == 4
+    assert found.outward > 0.9 and found.hit_rate > 0.8
