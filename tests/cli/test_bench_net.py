@@ -119,6 +119,8 @@ def test_panels_are_numbers_of_garments_and_lines_run_through_sizes():
     assert {p[0] for p in found} == {"3 garments"}, "nothing to compare with one or two"
     assert [p[1] for p in found].count("network, live") == 2
     assert {p[1] for p in found} == {"lbs", "network, live", "network, 32 frames"}
+    beside = [*rows, row("network", "paper", 1, 3, 30.0)]
+    assert [p[1] for p in points(beside)].count("network, live") == 2, "no line to another family"
     low = [dataclasses.replace(r, precision="bfloat16") for r in rows]
     assert points(low)[-1][1] == "network bfloat16, 32 frames"
     assert len(points(rows[:3])) == 3, "without networks every number is shown"

@@ -116,6 +116,8 @@ def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
         if math.isnan(r.rmse_mm) or (panels and r.garments not in panels):
             continue
         name = r.method if r.precision == "float32" else f"{r.method} {r.precision}"
+        # Another family is no rung of the same ladder.
+        name = f"{name} (paper)" if r.size == "paper" else name
         if r.method.startswith("network"):
             name += ", live" if r.batch == 1 else f", {r.batch} frames"
         panel = "one garment" if r.garments == 1 else f"{r.garments} garments"

@@ -36,7 +36,7 @@ button { min-width: 5em; }
 <model-viewer id="view" camera-controls autoplay interaction-prompt="none" shadow-intensity="0.6"
  tone-mapping="neutral" exposure="0.85" camera-orbit="25deg 80deg __AWAY__m"
  camera-target="__MIDDLE__" field-of-view="30deg" max-camera-orbit="auto auto __FARTHEST__m"
- alt="__TITLE__"></model-viewer>
+ alt="__TITLE__"><div slot="progress-bar"></div></model-viewer>
 <form onsubmit="return false">
 <button type="button" id="play">pause</button>
 <input type="range" id="time" min="0" max="__LAST__" value="0" step="1" aria-label="frame">
