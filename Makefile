@@ -4,14 +4,14 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 SRC := $(shell find src tests experiments -name '*.py' 2>/dev/null)
 
-.PHONY: demo test check format clean
+.PHONY: demo test check docs format clean
 
 # One environment serves all targets; uv.lock decides every version.
 $(VENV)/.ready: pyproject.toml uv.lock
 	@$(PYTHON) -c "import sys; v = sys.version_info; sys.exit(0 if (3, 11) <= v[:2] < (3, 14) else f'physxnet_jax needs Python 3.11 to 3.13, $(PYTHON) is {v[0]}.{v[1]}: set PYTHON=python3.12, say')"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet "uv>=0.8"
-	UV_PROJECT_ENVIRONMENT=$(abspath $(VENV)) $(BIN)/uv sync --quiet --frozen --inexact --python $(BIN)/python --extra usd --extra gltf --extra mesh --extra render --extra train --extra export --extra dev
+	UV_PROJECT_ENVIRONMENT=$(abspath $(VENV)) $(BIN)/uv sync --quiet --frozen --inexact --python $(BIN)/python --extra usd --extra gltf --extra mesh --extra viewer --extra render --extra train --extra export --extra docs --extra dev
 	@touch $@
 
 demo: $(VENV)/.ready
@@ -25,6 +25,9 @@ check: $(VENV)/.ready
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+docs: $(VENV)/.ready
+	$(BIN)/python -m sphinx -W -q -b html docs docs/_build/html
 
 format: $(VENV)/.ready
 	$(BIN)/ruff check --fix .

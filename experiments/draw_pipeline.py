@@ -16,20 +16,10 @@ import physxnet_jax as px
 from physxnet_jax.dressing import dress
 from physxnet_jax.models import clip_features
 from physxnet_jax.motion import clip_transforms, load_motion
-from physxnet_jax.viewer import render_frame, render_preview
+from physxnet_jax.viewer import magnified, render_frame, render_preview, texel_picture
 
 FRAME = 9
 SIZE = 288
-
-
-def picture(values: np.ndarray, texels: np.ndarray, size: int) -> np.ndarray:
-    """A map of three channels as a picture: zero is grey, empty texels are white."""
-    scale = np.quantile(np.abs(values), 0.98)
-    flat = np.full((size * size, 3), 255, np.uint8)
-    flat[texels] = (127 + 120 * np.clip(values / scale, -1, 1)).astype(np.uint8)
-    image = flat.reshape(size, size, 3)
-    pick = np.arange(SIZE) * size // SIZE
-    return image[pick][:, pick]
 
 
 def main() -> None:
@@ -50,7 +40,7 @@ def main() -> None:
     texels = np.asarray(predictor.atlas.texels)
     shown = [inputs[:, 6:9], inputs[:, 15:18], inputs[:, 18:21]]
     shown += [np.asarray(outputs[t][0]) for t in predictor.config.templates]
-    pictures = [picture(x, texels, size) for x in shown]
+    pictures = [magnified(texel_picture(x, texels, size), SIZE) for x in shown]
     maps = np.concatenate([np.concatenate(pictures[:3], 1), np.concatenate(pictures[3:], 1)])
     clip = dress(motion, ["top", "bottom"], frames=FRAME + 1)
     mesh = render_frame(clip.meshes, FRAME, size=(512, 2 * SIZE))

@@ -22,7 +22,9 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 def _free_compiled_code():
     """Each compiled function holds memory maps, of which a process has 65,530."""
     yield
-    jax.clear_caches()
+    maps = pathlib.Path("/proc/self/maps")
+    if not maps.exists() or maps.read_bytes().count(b"\n") > 30_000:
+        jax.clear_caches()
 
 
 @pytest.fixture(scope="session")

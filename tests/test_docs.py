@@ -14,6 +14,7 @@ from physxnet_jax.dressing import load_scene
 from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
 from physxnet_jax.garment import FABRICS, TEMPLATES
 from physxnet_jax.io import list_weights, read_card
+from physxnet_jax.motion import read_joint_map
 from physxnet_jax.simulation import EFFECTS, Air
 from physxnet_jax.training import TrainConfig
 
@@ -46,6 +47,14 @@ def test_every_link_leads_somewhere():
     for path in [ROOT / "README.md", *ROOT.glob("docs/*.md")]:
         for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", path.read_text()):
             assert (path.parent / link).exists(), f"{path.name}: {link}"
+
+
+def test_the_joint_map_that_is_shown_is_one(tmp_path):
+    text = (ROOT / "docs/motion.md").read_text()
+    path = tmp_path / "names.toml"
+    path.write_text(re.search(r"```toml\n(.*?)```", text, re.S).group(1))
+    joints = read_joint_map(path)
+    assert len(joints) == 13 and all(f"`{b}`" in text or f"{b} =" in text for b in joints)
 
 
 def test_every_effect_is_listed():

@@ -23,7 +23,7 @@ def test_every_command_parses_and_every_target_exists():
         assert (ROOT / path).is_file(), path
     words = set(re.findall(r"physxnet (\w+)", TEXT))
     there = {"dress", "demo", "doctor", "clips", "simulate", "effects", "bench", "stress"}
-    there |= {"dataset", "train", "evaluate", "export", "calibrate", "inspect", "fit"}
+    there |= {"dataset", "train", "evaluate", "export", "calibrate", "inspect", "fit", "view"}
     assert words <= there
     with pytest.raises(SystemExit):
         main(["undress"])

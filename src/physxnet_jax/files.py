@@ -1,9 +1,15 @@
-"""Writing files whole or not at all."""
+"""Writing files whole or not at all, reading archives of unknown origin."""
 
 import contextlib
+import math
 import os
 import pathlib
-from collections.abc import Iterator
+import zipfile
+import zlib
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
 
 
 @contextlib.contextmanager
@@ -28,3 +34,58 @@ def whole_file(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def read_arrays(
+    path: str | pathlib.Path, names: Sequence[str], *, limit: int = 2_000_000_000
+) -> dict[str, np.ndarray]:
+    """Arrays of an `.npz`, by name; those that aren't in it are left out.
+
+    Nothing is unpickled. What an array's header announces is compared with what the
+    archive holds before memory is asked for.
+
+    Args:
+        path: The archive.
+        names: Which arrays to read.
+        limit: Largest size of all of them together, unpacked [bytes].
+
+    Raises:
+        ValueError: Not such an archive, an array of objects, a header that lies, or
+            too much data.
+        OSError: The file can't be opened.
+    """
+    out: dict[str, np.ndarray] = {}
+    total = 0
+    try:
+        with zipfile.ZipFile(path) as archive:
+            held = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
+            for name in names:
+                if name not in held:
+                    continue
+                info = held[name]
+                total += info.file_size
+                if total > limit:
+                    raise ValueError(f"over {limit / 1e9:.1f} GB of data")
+                with archive.open(info) as member:
+                    _check_header(member, name, info.file_size)
+                with archive.open(info) as member:
+                    out[name] = np.lib.format.read_array(member, allow_pickle=False)
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        raise ValueError(f"not an archive of arrays ({error})") from error
+    return out
+
+
+def _check_header(member: Any, name: str, size: int) -> None:
+    version = np.lib.format.read_magic(member)
+    readers = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    if version not in readers:
+        raise ValueError(f"'{name}' is of format {version}")
+    shape, _, dtype = readers[version](member)
+    if dtype.hasobject:
+        raise ValueError(f"'{name}' holds Python objects, which are never loaded")
+    wanted = math.prod(shape) * dtype.itemsize
+    if wanted != size - member.tell():
+        raise ValueError(f"'{name}' announces {wanted:,} bytes and has {size - member.tell():,}")

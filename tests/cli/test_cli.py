@@ -72,6 +72,22 @@ def test_errors_are_one_sentence_and_exit_code_two(capsys, words, says):
     assert "Traceback" not in error
 
 
+def test_a_joint_map_reaches_the_reader(tmp_path, capsys):
+    path = tmp_path / "names.toml"
+    path.write_text('Hips = "pelvis"\n')
+    (tmp_path / "a.bvh").write_text(
+        "HIERARCHY\nROOT pelvis\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\n"
+        "End Site\n{\nOFFSET 0 1 0\n}\n}\nMOTION\nFrames: 1\nFrame Time: 0.1\n0 0 0\n"
+    )
+    for words in (["dress"], ["simulate"]):
+        words = [*words, str(tmp_path / "a.bvh"), "--joint-map", str(path)]
+        assert main(words) == 2
+        # Without the map the names themselves would be unknown.
+        assert "the joint map lacks" in " ".join(capsys.readouterr().err.split())
+        assert main(words[:2]) == 2
+        assert "unknown joints" in " ".join(capsys.readouterr().err.split())
+
+
 def test_other_body_shapes_stand_on_the_floor(tmp_path):
     out = tmp_path / "a.npz"
     words = [

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from hypothesis import given, settings, strategies as st
 
+from physxnet_jax.cli import main
 from physxnet_jax.errors import FormatError
 from physxnet_jax.io import AnimatedMesh, read_mdd, write_clip, write_mdd
 from physxnet_jax.io._gltf import MAX_FRAMES
@@ -102,11 +103,16 @@ def test_gltf_is_what_trimesh_reads(tmp_path, clip):
     )
 
 
-def test_gltf_refuses_clips_that_no_viewer_would_hold(tmp_path):
+def test_gltf_refuses_clips_that_no_viewer_would_hold(tmp_path, monkeypatch, capsys):
     long = np.zeros((MAX_FRAMES + 1, 3, 3), np.float32)
     with pytest.raises(FormatError, match="too many for glTF"):
         write_clip(tmp_path / "a.glb", [AnimatedMesh("a", long, np.array([[0, 1, 2]]))], 30.0)
     assert not (tmp_path / "a.glb").exists()
+    # And before anything is computed.
+    monkeypatch.setattr("physxnet_jax.io._gltf.MAX_FRAMES", 20)
+    monkeypatch.setattr("physxnet_jax.dressing.dress", None)
+    assert main(["dress", "walk", "--wear", "bottom", "-o", str(tmp_path / "b.html")]) == 2
+    assert "too many for glTF" in capsys.readouterr().err
 
 
 def test_one_frame_is_a_still(tmp_path, clip):

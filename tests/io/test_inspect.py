@@ -9,8 +9,7 @@ import pytest
 from physxnet_jax.cli import main
 from physxnet_jax.dressing import dress
 from physxnet_jax.errors import FormatError, MeshError
-from physxnet_jax.garment import decimate, template
-from physxnet_jax.geometry import make_mesh
+from physxnet_jax.garment import template
 from physxnet_jax.io import fit_garment, inspect_garment, read_obj, write_obj
 
 
@@ -80,7 +79,7 @@ def test_a_mesh_that_is_nowhere_is_put_in_its_place(tmp_path, trousers):
     v, faces = trousers
     path = saved(tmp_path, "far.obj", 7.3 * v + [40.0, -3.0, 9.0], faces)
     found = inspect_garment(path)
-    assert found.unit is None and "--like" in str(found.command)
+    assert found.unit is None and "--like bottom" in str(found.command)
     with pytest.raises(MeshError, match="no unit"):
         fit_garment(path, tmp_path / "out.obj")
     done, after = fit_garment(path, tmp_path / "out.obj", like="bottom")
@@ -91,11 +90,12 @@ def test_a_mesh_that_is_nowhere_is_put_in_its_place(tmp_path, trousers):
 
 def test_edges_become_as_long_as_asked(tmp_path, trousers):
     pytest.importorskip("fast_simplification")
-    small = decimate(make_mesh(*trousers), 0.04)
-    saved(tmp_path, "coarse.obj", np.asarray(small.vertices), np.asarray(small.faces))
-    done, fine = fit_garment(tmp_path / "coarse.obj", tmp_path / "fine.obj", edge_length=0.025)
-    assert small.faces.shape[0] < 0.6 * len(trousers[1]) and "split" in " ".join(done)
-    assert fine.health.longest_edge < 0.03 and fine.health.components == 1
+    path = saved(tmp_path, "a.obj", *trousers)
+    done, found = fit_garment(path, tmp_path / "b.obj", coarser=0.04, edge_length=0.05)
+    assert "decimated 5,366 faces" in done[1] and "split" in done[2]
+    assert found.health.faces < 0.6 * len(trousers[1])
+    # Vertices that are moved out of the body afterwards stretch edges a little.
+    assert found.health.longest_edge < 0.055 and found.health.components == 1
 
 
 def test_the_commands_say_it_too(tmp_path, trousers, capsys):

@@ -15,7 +15,7 @@ from ..files import whole_file
 from ..io import load_garment
 from ..motion import load_motion
 from ..viewer import draw_work_precision
-from ._commands import Bench
+from ._experiment_commands import Bench
 from ._machine import machine
 
 

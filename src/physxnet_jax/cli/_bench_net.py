@@ -27,7 +27,7 @@ from ..io import load_predictor
 from ..models import at_precision
 from ..motion import load_motion
 from ..viewer import draw_work_precision
-from ._commands import Bench
+from ._experiment_commands import Bench
 from ._machine import machine
 from ._progress import progress_bars
 

@@ -19,7 +19,7 @@ class Dress:
     """
 
     motion: tyro.conf.Positional[str]
-    """A .amc, .bvh or .npz file, or a built-in clip (see `physxnet clips`)."""
+    """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
     wear: tuple[str, ...] = ("top", "bottom")
     """Templates (top, bottom, dress) and OBJ files."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
@@ -42,6 +42,8 @@ class Dress:
     """True rate of the motion file, where its header is wrong or silent."""
     skeleton: pathlib.Path | None = None
     """The ASF of an AMC file, if it doesn't lie beside it."""
+    joint_map: pathlib.Path | None = None
+    """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
     weights: str = "local"
     """Name or folder of network weights."""
     shape: tuple[str, ...] = ()
@@ -79,7 +81,7 @@ class Fit:
 
     Examples:
       physxnet fit my_shirt.obj -o my_shirt_fitted.obj
-      physxnet fit scan.obj --like dress --edge-length 12 -o scan_fitted.obj
+      physxnet fit scan.obj --like dress --decimate 12 -o scan_fitted.obj
     """
 
     file: tyro.conf.Positional[pathlib.Path]
@@ -89,7 +91,9 @@ class Fit:
     like: Literal["top", "bottom", "dress"] | None = None
     """Scale and move it to where this template is, instead of guessing its unit."""
     edge_length: float | None = None
-    """Split or decimate towards edges of this length [mm]."""
+    """Split edges that are longer than this [mm]."""
+    decimate: float | None = None
+    """Before that, make it coarser: edges of about this length [mm]; drops texture coordinates."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -145,28 +149,6 @@ class Clips:
 
 
 @dataclasses.dataclass(frozen=True)
-class Stress:
-    """Run the simulator's hard cases: what is measured, its bound, whether it holds.
-
-    Examples:
-      physxnet stress
-      physxnet stress --cases free_fall scrambled_start --json stress.json
-      physxnet stress --peers blender newton
-    """
-
-    cases: tuple[str, ...] = ()
-    """Names of cases; all of them if none is given."""
-    peers: tuple[Literal["blender", "newton"], ...] = ()
-    """Other simulators that run the cases they can (PHYSXNET_BLENDER, PHYSXNET_NEWTON)."""
-    json: pathlib.Path | None = None
-    """Write the rows to this file."""
-    quiet: bool = False
-    """Print nothing but errors."""
-    debug: bool = False
-    """Show the trace of an error."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Simulate:
     """Simulate a scene: a motion with garments, or a scene file (TOML).
 
@@ -196,6 +178,8 @@ class Simulate:
     """Garments collide with themselves."""
     fps: float = 30.0
     """Frames a second."""
+    joint_map: pathlib.Path | None = None
+    """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
     frames: int | None = None
     """Stop after this many frames."""
     engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
@@ -237,111 +221,42 @@ class Effects:
 
 
 @dataclasses.dataclass(frozen=True)
-class Bench:
-    """What accuracy costs in time: solvers and settings, or networks and their sizes.
+class View:
+    """Open the viewer in a browser: motions, garments, methods, shapes, errors, maps.
+
+    It listens on this machine alone. Over ssh, forward its port:
+    ssh -L 8080:localhost:8080 machine
 
     Examples:
-      physxnet bench net --weights nano small local --data runs/ours --out out/net.json
-      physxnet bench sim --out out/sim_bench.json
-      physxnet bench sim --scenes sheet
-      physxnet bench sim --blender 5 10 15 20 --shirt shirt.obj --motion punch.bvh
-      physxnet bench sim --newton 5 10 20
+      physxnet view
+      physxnet view dance.bvh --wear my_shirt.obj bottom
+      physxnet view walk --wear dress --html walk.html
     """
 
-    what: tyro.conf.Positional[Literal["sim", "net"]]
-    """sim: the simulator. net: networks beside skinning and the simulator."""
-    weights: tuple[str, ...] = ("local",)
-    """net: names or folders of weights, or runs."""
-    data: pathlib.Path | None = None
-    """net: a dataset whose test actions give the errors; times alone without one."""
-    simulator: tuple[Literal["draft", "standard", "fine", "noise"], ...] = ()
-    """net: accuracies of the simulator to run as well; noise is standard with jitter."""
-    precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32",)
-    """net: what the networks' arithmetic is done in."""
-    backward: bool = False
-    """net: measure gradients as well."""
-    times: bool = False
-    """net: measure the times of these methods' rows again, and nothing else."""
-    batches: tuple[int, ...] = (1, 32)
-    """net: frames a call."""
-    garments: tuple[int, ...] = (1, 2, 3)
-    """net: how many garments are worn."""
-    scenes: tuple[Literal["sheet", "skirt", "shirt"], ...] = ("sheet", "skirt", "shirt")
-    """A hanging sheet, a dress on a spin, a shirt on a punch."""
-    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Rows as JSON, with a table (.md) and a diagram (.png) beside it; goes on from there."""
-    frames: int = 20
-    """Frames of the scenes with a body."""
-    shirt: pathlib.Path | None = None
-    """An OBJ file instead of the template top."""
-    motion: str = "punch"
-    """What the person in the shirt does: a motion file or a built-in clip."""
-    blender: tuple[int, ...] = ()
-    """Qualities at which Blender runs too, the finest last."""
-    newton: tuple[int, ...] = ()
-    """Substeps at which Newton runs too, likewise."""
-    quiet: bool = False
-    """Print nothing but errors."""
-    debug: bool = False
-    """Show the trace of an error."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Dataset:
-    """Build a dataset of simulated clothes from motion files, or look it over.
-
-    Stopped, the same command goes on where it was; shards may run side by side.
-
-    Examples:
-      physxnet dataset build experiments/configs/dataset_physxnet.py --out runs/ours
-      physxnet dataset build experiments/configs/dataset_blender.py --out runs/b --shard 1/4
-      physxnet dataset check runs/ours --sheet out/ours.png
-    """
-
-    what: tyro.conf.Positional[Literal["build", "check"]]
-    """build: simulate. check: look for explosions, penetration, jitter, wrong counts."""
-    target: tyro.conf.Positional[str]
-    """build: a configuration, a Python file with CONFIG. check: a dataset's folder."""
-    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """build: the dataset's folder."""
-    mocap: pathlib.Path | None = None
-    """Where ACTIONS.csv and the motion files lie; mocap in $PHYSXNET_DATA or ../shared."""
-    shard: str = "0/1"
-    """build: i/n, every n-th action from the i-th."""
-    only: tuple[str, ...] = ()
-    """build: names of actions."""
-    sheet: pathlib.Path | None = None
-    """check: a contact sheet, .png."""
-    json: pathlib.Path | None = None
-    """check: findings as JSON."""
-    quiet: bool = False
-    """Print nothing but errors."""
-    debug: bool = False
-    """Show the trace of an error."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Train:
-    """Train a network on a dataset.
-
-    Stopped, the same command goes on where it was.
-
-    Examples:
-      physxnet train experiments/configs/local_cpu.py --data runs/ours --out runs/local
-    """
-
-    config: tyro.conf.Positional[str]
-    """A Python file with CONFIG, a TrainConfig."""
-    data: tyro.conf.UseAppendAction[tuple[pathlib.Path, ...]]
-    """Folders of datasets."""
-    out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
-    """The run's folder: checkpoints, metrics.jsonl, TensorBoard events, weights."""
-    splits: tuple[str, ...] = ("train",)
-    """Parts of the datasets that are learned from."""
-    steps: int | None = None
-    """Stop after this many steps in all."""
-    name: str | None = None
-    """Name of the weights; the configuration's file name."""
+    motion: tyro.conf.Positional[str] = "walk"
+    """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
+    wear: tuple[str, ...] = ("top", "bottom")
+    """Templates (top, bottom, dress) and OBJ files."""
+    method: Literal["network", "lbs", "simulate"] = "network"
+    """network, lbs (skinning alone) or simulate."""
+    weights: str = "local"
+    """Name of network weights."""
+    compare: bool = False
+    """Simulate the same clothes beside it and colour by the distance."""
+    frames: int = 150
+    """Frames at most."""
+    fps: float = 30.0
+    """Frames a second."""
+    joint_map: pathlib.Path | None = None
+    """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
+    html: pathlib.Path | None = None
+    """Write one page that plays by itself, and end."""
+    host: str = "127.0.0.1"
+    """Address to listen at; 0.0.0.0 lets every machine of the network in."""
+    port: int = 8080
+    """Port to listen at; the next free one is taken."""
+    browser: bool = True
+    """Open the browser."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -368,40 +283,6 @@ class Export:
     """Push vertices that end inside the body onto it."""
     platforms: tuple[str, ...] = ("cpu", "cuda")
     """Where it will run."""
-    quiet: bool = False
-    """Print nothing but errors."""
-    debug: bool = False
-    """Show the trace of an error."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Evaluate:
-    """The error of methods on every action of a dataset, beside what each costs.
-
-    Methods: lbs, nearest, mlp, draft, standard, fine, noise, names of weights, folders of
-    weights or of runs. With +push after a network's name its vertices are pushed out of
-    the body.
-
-    Examples:
-      physxnet evaluate local local+push lbs --data runs/ours --out out/errors.json
-      physxnet evaluate lbs nearest mlp draft noise --data runs/ours --split test
-    """
-
-    methods: tyro.conf.Positional[tuple[str, ...]]
-    """What is measured."""
-    data: pathlib.Path
-    """A dataset's folder: what is measured against."""
-    split: str = "test"
-    """train, test or extra."""
-    learn_from: pathlib.Path | None = None
-    """Dataset that nearest and mlp learn from; the same one."""
-    templates: tuple[Literal["top", "bottom", "dress"], ...] = ("top", "bottom", "dress")
-    """Garments."""
-    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Rows as JSON; tables (.md) and two charts (_vertices.png, _texels.png) beside it.
-    Rows that are there already are kept."""
-    times: bool = False
-    """Measure the times of these methods' rows again, in one go, and nothing else."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False

@@ -26,8 +26,8 @@ from ..files import whole_file
 from ..garment import TEMPLATES, Template, template
 from ..io import AnimatedMesh
 from ..viewer import render_frame
-from ._commands import Dataset
 from ._configs import mocap_folder, read_config
+from ._experiment_commands import Dataset
 from ._progress import progress_bars
 
 _TILE = (220, 260)

@@ -28,7 +28,7 @@ from ..files import whole_file
 from ..io import load_predictor
 from ..simulation import ACCURACY
 from ..viewer import draw_bars
-from ._commands import Evaluate
+from ._experiment_commands import Evaluate
 from ._progress import progress_bars
 
 

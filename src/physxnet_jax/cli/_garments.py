@@ -27,9 +27,13 @@ def inspect(command: Inspect, console: Console) -> int:
 
 def fit(command: Fit, console: Console) -> int:
     """Mends a file; says what was done and how the result looks."""
-    length = None if command.edge_length is None else 1e-3 * command.edge_length
+    longest, coarser = (
+        None if mm is None else 1e-3 * mm for mm in (command.edge_length, command.decimate)
+    )
     with console.status("fitting"):
-        done, result = fit_garment(command.file, command.out, like=command.like, edge_length=length)
+        done, result = fit_garment(
+            command.file, command.out, like=command.like, edge_length=longest, coarser=coarser
+        )
     for step in done:
         console.print(step, highlight=False)
     _show(result, console)

@@ -10,23 +10,20 @@ from rich.console import Console
 
 from ..errors import BrokenInstallError, PhysXNetError
 from ._commands import (
-    Bench,
     Calibrate,
     Clips,
-    Dataset,
     Demo,
     Doctor,
     Dress,
     Effects,
-    Evaluate,
     Export,
     Fit,
     Inspect,
     Simulate,
-    Stress,
-    Train,
+    View,
 )
 from ._doctor import doctor
+from ._experiment_commands import Bench, Dataset, Evaluate, Stress, Train
 from ._progress import progress_bars
 
 _Command = (
@@ -45,6 +42,7 @@ _Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[View, tyro.conf.subcommand("view")]
 )
 
 
@@ -103,7 +101,8 @@ def _run(
     | Export
     | Calibrate
     | Inspect
-    | Fit,
+    | Fit
+    | View,
     console: Console,
 ) -> int:
     if isinstance(command, Dataset | Train | Evaluate):
@@ -122,6 +121,10 @@ def _run(
         if isinstance(command, Inspect):
             return inspect(command, console)
         return fit(command, Console(quiet=True) if command.quiet else console)
+    if isinstance(command, View):
+        from ._view import view
+
+        return view(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Bench):
         from ._bench import bench
         from ._bench_net import bench_net
@@ -195,8 +198,11 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
             fps=command.fps,
             source_fps=command.source_fps,
             skeleton=command.skeleton,
+            joint_map=command.joint_map,
             shape=shape,
         )
+        if command.out is not None:
+            check_output(command.out, min(motion.num_frames, command.frames or motion.num_frames))
         ways = {
             "method": command.method,
             "accuracy": command.accuracy,

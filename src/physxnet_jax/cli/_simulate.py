@@ -56,11 +56,14 @@ def simulate(command: Simulate, console: Console) -> int:
             command.scene,
             command.wear,
             fps=command.fps,
+            joint_map=command.joint_map,
             frames=command.frames,
             fabric=command.fabric,
             also=also,
         )
     scene = job.scene
+    if command.out is not None:
+        check_output(command.out, job.motion.num_frames)
     accuracy = command.accuracy or job.accuracy
     out = command.out or command.preview
     keep = None if out is None else out.with_name(f".{out.name}.unfinished")

@@ -13,7 +13,7 @@ from ..evaluation import CASES, PEER_CASES, Finding, run_case, run_peer
 from ..files import whole_file
 from ..simulation.blender import simulate_blender
 from ..simulation.newton import simulate_newton
-from ._commands import Stress
+from ._experiment_commands import Stress
 
 _ENGINES = {"blender": simulate_blender, "newton": simulate_newton}
 

@@ -7,8 +7,8 @@ from rich.console import Console
 from ..data import CARD, list_sequences, read_note, read_sequence
 from ..io import save_predictor
 from ..training import TrainConfig, read_metrics, train as run
-from ._commands import Train
 from ._configs import read_config
+from ._experiment_commands import Train
 from ._progress import progress_bars
 
 

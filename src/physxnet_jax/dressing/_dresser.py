@@ -61,7 +61,8 @@ class Clothed:
     """Clothes in a pose, or in each of several frames.
 
     Attributes:
-        vertices: Vertices of each garment by name [m], shape [*frames, vertices, 3].
+        vertices: Vertices of each garment by name [m], shape
+            ``[*frames, vertices, 3]``.
         ok: Whether all of them are finite: a joint that isn't spoils the frames whose
             window holds it, and no other.
     """

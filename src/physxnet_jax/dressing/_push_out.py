@@ -14,7 +14,6 @@ from ..body import NUM_BODY_VERTICES, Body, blend_rotations
 from ..geometry import (
     Stencil,
     TriMesh,
-    closest_among,
     gaussian_stencil,
     mesh_edges,
     safe_normalize,
@@ -22,7 +21,7 @@ from ..geometry import (
 )
 from ..models import Wearable, skin_points
 from ..typing import pytree
-from ._skirt import SkirtPatch, make_skirt_patch, skirt_lift
+from ._skirt import SkirtPatch, make_skirt_patch, skin_foot, skirt_lift
 
 _Result = TypeVar("_Result")
 
@@ -194,10 +193,7 @@ def _clear_of_skin(
     least: Float[Array, " lying"],
     most: Float[Array, " lying"],
 ) -> tuple[Float[Array, " lying"], Float[Array, "lying 3"]]:
-    hit = closest_among(TriMesh(skin, patch.faces), points, patch.candidates)
-    tri = patch.faces[hit.face]
-    foot = jnp.einsum("vk,vkc->vc", hit.weights, skin[tri])
-    normal = safe_normalize(jnp.einsum("vk,vkc->vc", hit.weights, normals[tri]))
+    foot, normal = skin_foot(skin, normals, patch.faces, points, patch.candidates)
     height = jnp.sum((points - foot) * normal, axis=1)
     # Deeper points are on another limb's far side, not in the skin.
     fade = jnp.clip((height + _DEEPEST) / (0.25 * _DEEPEST), 0.0, 1.0)

@@ -17,7 +17,17 @@ from ..simulation import ACCURACY, EFFECTS, Effect, Scene, standard_effects
 from ._blocks import inside_out
 from ._meshes import with_names
 
-_KEYS = ("motion", "fps", "frames", "accuracy", "garments", "shape", "effects", "also")
+_KEYS = (
+    "motion",
+    "joint_map",
+    "fps",
+    "frames",
+    "accuracy",
+    "garments",
+    "shape",
+    "effects",
+    "also",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +50,7 @@ def make_scene(
     wear: Sequence[str | pathlib.Path | Garment] = ("top", "bottom"),
     *,
     fps: float = 30.0,
+    joint_map: str | pathlib.Path | None = None,
     frames: int | None = None,
     accuracy: str = "standard",
     fabric: str | None = None,
@@ -53,6 +64,7 @@ def make_scene(
         motion: A motion, a motion file, or the name of a built-in clip.
         wear: Garments, OBJ files or template names; put into the order of layers.
         fps: Frames a second.
+        joint_map: File of joint names, for a motion file of unknown ones.
         frames: Keep only this many frames.
         accuracy: ``draft``, ``standard`` or ``fine``.
         fabric: Name of a fabric for all garments; their own if None.
@@ -71,7 +83,7 @@ def make_scene(
     if isinstance(motion, Motion):
         clip = motion
     else:
-        clip = load_motion(motion, fps=fps, body=body, shape=shape)
+        clip = load_motion(motion, fps=fps, joint_map=joint_map, body=body, shape=shape)
     if frames is not None:
         if frames < 1:
             raise FormatError(f"frames is {frames}; ask for at least one.")
@@ -92,6 +104,7 @@ def load_scene(path: str | pathlib.Path) -> SceneFile:
     ::
 
         motion = "walk"            # a built-in clip or a motion file
+        joint_map = "names.toml"   # only for a file of unknown joint names
         garments = ["bottom", "top"]
         frames = 60
         accuracy = "standard"
@@ -136,6 +149,7 @@ def load_scene(path: str | pathlib.Path) -> SceneFile:
         _beside(path, text["motion"]),
         garments,
         fps=float(text.get("fps", 30.0)),
+        joint_map=_beside(path, text["joint_map"]) if "joint_map" in text else None,
         frames=text.get("frames"),
         accuracy=text.get("accuracy", "standard"),
         shape=load_body().shape(**text["shape"]) if "shape" in text else None,

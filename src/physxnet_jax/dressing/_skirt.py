@@ -151,7 +151,6 @@ def skirt_lift(
     Returns:
         Displacements [m] and heights above the nearest skin [m].
     """
-    mesh = TriMesh(skin, faces)
     # All pairs as products of matrices, about a point among them, where sums of squares are
     # precise; which skin point is taken needs no derivative.
     dense = functools.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
@@ -164,11 +163,7 @@ def skirt_lift(
     squared = jnp.sum(p * p, axis=1)[:, None] + jnp.sum(m * m, axis=1)[None] - 2.0 * dense(p, m.T)
 
     def meet(pick: Array, where: Array) -> tuple[Array, Array]:
-        """Foot and normal of the skin near ``where``, on a patch."""
-        hit = closest_among(mesh, where, patch.table[pick])
-        tri = faces[hit.face]
-        foot = jnp.einsum("hk,hkx->hx", hit.weights, skin[tri])
-        return foot, safe_normalize(jnp.einsum("hk,hkx->hx", hit.weights, normals[tri]))
+        return skin_foot(skin, normals, faces, where, patch.table[pick])
 
     foot, near = meet(_least(squared, patch.compared), points)
     height = jnp.sum((points - foot) * near, axis=1)
@@ -188,6 +183,28 @@ def skirt_lift(
     share = (share * share * (3 - 2 * share))[:, None]
     long = jnp.clip(way, 0.0, _FARTHEST)[:, None] * outward
     return short + share * (long - short), height
+
+
+def skin_foot(
+    skin: Float[Array, "skin 3"],
+    normals: Float[Array, "skin 3"],
+    faces: Int[Array, "faces 3"],
+    points: Float[Array, "points 3"],
+    candidates: Int[Array, "points k"],
+) -> tuple[Float[Array, "points 3"], Float[Array, "points 3"]]:
+    """The nearest points of the skin [m] and its smooth unit normals there.
+
+    Args:
+        skin: Skin vertices in this pose [m].
+        normals: Their normals.
+        faces: Triangles over them.
+        points: Where from [m].
+        candidates: Triangles compared for each.
+    """
+    hit = closest_among(TriMesh(skin, faces), points, candidates)
+    tri = faces[hit.face]
+    foot = jnp.einsum("pk,pkx->px", hit.weights, skin[tri])
+    return foot, safe_normalize(jnp.einsum("pk,pkx->px", hit.weights, normals[tri]))
 
 
 def _least(

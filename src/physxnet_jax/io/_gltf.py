@@ -35,23 +35,35 @@ def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
         Khronos, glTF 2.0, sections 3.7.2.2 (morph targets) and 3.11 (animations).
     """
     frames = len(meshes[0].positions)
-    if frames > MAX_FRAMES:
-        raise FormatError(
-            f"{path}: {frames} frames are too many for glTF, which takes {MAX_FRAMES}: write"
-            " .usdc or .pc2, or fewer frames (--frames)."
-        )
-    try:
-        import pygltflib
-    except ImportError as error:
-        raise MissingDependencyError(
-            "Writing glTF needs pygltflib: pip install 'physxnet-jax[gltf]'."
-        ) from error
+    check_gltf(path, frames)
+    import pygltflib
+
     file = _Builder(pygltflib)
     for m in meshes:
         file.add(m)
     file.animate(frames, fps)
     with whole_file(path) as part, part.open("wb") as target:
         target.write(b"".join(file.document().save_to_bytes()))
+
+
+def check_gltf(path: str | pathlib.Path, frames: int | None = None) -> None:
+    """Fails as `write_gltf` would, before there is anything to write.
+
+    Args:
+        path: Named in the error.
+        frames: How many there will be, if that is known.
+    """
+    if frames is not None and frames > MAX_FRAMES:
+        raise FormatError(
+            f"{path}: {frames} frames are too many for glTF, which takes {MAX_FRAMES}: write"
+            " .usdc or .pc2, or fewer frames (--frames)."
+        )
+    try:
+        import pygltflib  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Writing glTF needs pygltflib: pip install 'physxnet-jax[gltf]'."
+        ) from error
 
 
 class _Builder:

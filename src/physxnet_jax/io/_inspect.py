@@ -9,6 +9,7 @@ import numpy as np
 from ..body import Body, load_body
 from ..errors import MeshError
 from ..garment import (
+    TEMPLATES,
     Garment,
     MeshHealth,
     Template,
@@ -91,12 +92,15 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     body = load_body() if body is None else body
     raw = read_obj(path)
     size = tuple(float(s) for s in np.ptp(raw.vertices, axis=0))
+    skin = body.rest_mesh()
     problems, notes, options = [], [], []
     try:
         v, unit, up = place_on_body(path, raw.vertices, body)
     except MeshError as error:
         problems.append(str(error).partition(": ")[2])
-        options.append("--like top")
+        # The template whose place it fills best; the user may know better.
+        nearest = min(TEMPLATES, key=lambda t: _like(raw.vertices, template(t), skin)[2])
+        options.append(f"--like {nearest}")
         health = mesh_health(make_mesh(raw.vertices, raw.faces, raw.uv, raw.uv_faces))
         nan = float("nan")
         command = _command(path, options)
@@ -106,7 +110,6 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         )  # fmt: skip
     mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
     health = mesh_health(mesh)
-    skin = body.rest_mesh()
     distance, _ = clearance(skin, np.asarray(v, np.float32))
     inside = float(np.mean(distance < NEAREST))
     corner = np.asarray(v)[raw.faces]
@@ -140,8 +143,8 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         options.append("--edge-length 20")
     elif health.median_edge < _FINE:
         notes.append(
-            f"edges of {1e3 * health.median_edge:.1f} mm: finer than any map here; --edge-length 8"
-            " would make it quicker."
+            f"edges of {1e3 * health.median_edge:.1f} mm: finer than any map here; `physxnet fit"
+            " --decimate 8` would make it quicker."
         )
     if health.components > 1:
         notes.append(f"{health.components} parts that nothing joins: each moves by itself.")
@@ -163,6 +166,7 @@ def fit_garment(
     *,
     like: Template | None = None,
     edge_length: float | None = None,
+    coarser: float | None = None,
     body: Body | None = None,
 ) -> tuple[list[str], Inspection]:
     """Writes a garment that can be worn: on the body, clean, oriented and out of the skin.
@@ -171,8 +175,9 @@ def fit_garment(
         path: An ``.obj`` file.
         out: The ``.obj`` to write: metres, Y up, on the body at rest.
         like: Scale and move it onto this template's place instead of guessing its unit.
-        edge_length: Split edges longer than this; where most are shorter than half of it,
-            decimate to it [m].
+        edge_length: Split edges longer than this [m].
+        coarser: Before that, decimate to about this edge length [m]; texture coordinates
+            are lost.
         body: The body; the built-in one by default.
 
     Returns:
@@ -194,7 +199,7 @@ def fit_garment(
         v, unit, up = place_on_body(path, raw.vertices, body)
         done.append(f"read as {unit}, {up} up.")
     else:
-        v, told = _like(raw.vertices, template(like), skin)
+        v, told, _ = _like(raw.vertices, template(like), skin)
         done.append(told)
     mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
     before = mesh_health(mesh)
@@ -211,9 +216,18 @@ def fit_garment(
     if count:
         done.append(f"turned {count:,} faces round.")
     mesh = turned
+    count = int(mesh.faces.shape[0])
+    if coarser is not None:
+        textured = mesh.uv is not None
+        mesh = decimate(mesh, coarser)
+        if int(mesh.faces.shape[0]) < count:
+            lost = ", without its texture coordinates" if textured else ""
+            done.append(f"decimated {count:,} faces to {mesh.faces.shape[0]:,}{lost}.")
+    count = int(mesh.faces.shape[0])
     if edge_length is not None:
-        mesh, told = _resized(mesh, edge_length)
-        done += told
+        mesh = subdivide(mesh, edge_length)
+        if int(mesh.faces.shape[0]) > count:
+            done.append(f"split {count:,} faces into {mesh.faces.shape[0]:,}.")
     moved, low = lift_out(
         skin, np.asarray(mesh.vertices), np.asarray(mesh.faces), NEAREST, iterations=12
     )
@@ -229,23 +243,15 @@ def fit_garment(
     return done, inspect_garment(out, body=body)
 
 
-def _resized(mesh: TriMesh, edge_length: float) -> tuple[TriMesh, list[str]]:
-    health = mesh_health(mesh)
-    if health.median_edge < 0.5 * edge_length:
-        small = decimate(mesh, edge_length)
-        lost = ", without its texture coordinates" if mesh.uv is not None else ""
-        return small, [f"decimated {health.faces:,} faces to {small.faces.shape[0]:,}{lost}."]
-    if health.longest_edge > edge_length:
-        fine = subdivide(mesh, edge_length)
-        return fine, [f"split {health.faces:,} faces into {fine.faces.shape[0]:,}."]
-    return mesh, []
+def _like(vertices: np.ndarray, wanted: Garment, skin: TriMesh) -> tuple[np.ndarray, str, float]:
+    """The mesh scaled and moved onto a template's box, how, and how far off it is [m].
 
-
-def _like(vertices: np.ndarray, wanted: Garment, skin: TriMesh) -> tuple[np.ndarray, str]:
-    """The mesh scaled and moved onto a template's box, whichever axis of it is up."""
+    Whichever axis is up is found by its mean distance from the skin; sizes across count
+    as well, so that trousers aren't taken for a top.
+    """
     x = np.asarray(wanted.mesh.vertices, np.float64)
     low, high = x.min(axis=0), x.max(axis=0)
-    best = (np.inf, vertices, "")
+    best = (vertices, "it has no height.", np.inf)
     for up, turned in (
         ("Y", vertices),
         ("Z", vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]),
@@ -257,14 +263,11 @@ def _like(vertices: np.ndarray, wanted: Garment, skin: TriMesh) -> tuple[np.ndar
         middle = turned.min(axis=0) + 0.5 * size
         v = (turned - middle) * scale + 0.5 * (low + high)
         distance, _ = clearance(skin, v.astype(np.float32))
-        score = float(np.mean(np.abs(distance)))
-        if score < best[0]:
-            best = (
-                score,
-                v,
-                f"scaled by {scale:.4g}, {up} up, moved to where a {wanted.template} is.",
-            )
-    return best[1], best[2]
+        off = float(np.mean(np.abs(distance)) + np.mean(np.abs(scale * size - (high - low))))
+        if off < best[2]:
+            told = f"scaled by {scale:.4g}, {up} up, moved to where a {wanted.template} is."
+            best = (v, told, off)
+    return best
 
 
 def _hit_rate(body: Body, garment: Garment) -> float:

@@ -28,14 +28,19 @@ def write_usd(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: flo
     Raises:
         MissingDependencyError: Without usd-core.
     """
+    check_usd()
+    with whole_file(path) as part:
+        _write(part, meshes, fps)
+
+
+def check_usd() -> None:
+    """Fails where usd-core is missing."""
     try:
         import pxr  # noqa: F401
     except ImportError as error:
         raise MissingDependencyError(
             "Writing USD needs usd-core: pip install 'physxnet-jax[usd]'."
         ) from error
-    with whole_file(path) as part:
-        _write(part, meshes, fps)
 
 
 def _write(part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:

@@ -8,27 +8,36 @@ import numpy as np
 from ..errors import FormatError
 from ..files import whole_file
 from ._clip import AnimatedMesh
-from ._gltf import write_gltf
+from ._gltf import check_gltf, write_gltf
 from ._html import write_html
 from ._mdd import write_mdd
 from ._obj import write_obj
 from ._pc2 import write_pc2
-from ._usd import write_usd
+from ._usd import check_usd, write_usd
 
 EXTENSIONS = (".usdc", ".usd", ".usda", ".pc2", ".mdd", ".glb", ".html", ".obj", ".npz")
 
 
-def check_output(path: str | pathlib.Path) -> pathlib.Path:
-    """The path, if its extension is one that can be written.
+def check_output(path: str | pathlib.Path, frames: int | None = None) -> pathlib.Path:
+    """The path, if a clip can be written to it: asked before minutes are spent on one.
+
+    Args:
+        path: Where to.
+        frames: How many there will be, if that is known.
 
     Raises:
-        FormatError: Otherwise; the text lists the extensions.
+        FormatError: Another extension, whose text lists them, or too many frames.
+        MissingDependencyError: A library that the format needs isn't there.
     """
     path = pathlib.Path(path)
     if path.suffix.lower() not in EXTENSIONS:
         raise FormatError(
             f"{path}: can't write '{path.suffix}'; choose one of {', '.join(EXTENSIONS)}."
         )
+    if path.suffix.lower().startswith(".usd"):
+        check_usd()
+    if path.suffix.lower() in (".glb", ".html"):
+        check_gltf(path, frames)
     return path
 
 

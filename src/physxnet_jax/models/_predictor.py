@@ -302,7 +302,7 @@ def apply_offsets(
         Vertex positions. With zero offsets, ``local`` gives exactly the skinning.
 
     References:
-        PhysXNet, equation 3 and section 4.3.
+        PhysXNet, equations 3 and 9.
     """
     return place_sampled(wearable, rotations, translations, wearable.sample(offsets), family)
 

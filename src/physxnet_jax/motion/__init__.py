@@ -1,7 +1,9 @@
 """Motion of the body: files, retargeting, resampling and built-in clips."""
 
+from ._amass import amass_clip as amass_clip
 from ._asf_amc import read_amc as read_amc
 from ._bvh import read_bvh as read_bvh
+from ._gltf import read_gltf as read_gltf
 from ._load import load_motion as load_motion, save_motion as save_motion
 from ._motion import (
     Motion as Motion,
@@ -14,12 +16,15 @@ from ._motion import (
 )
 from ._procedural import CLIPS as CLIPS, procedural_clip as procedural_clip
 from ._retarget import (
-    JOINT_MAPS as JOINT_MAPS,
-    LIMBS as LIMBS,
-    find_joint_map as find_joint_map,
     foot_heights as foot_heights,
     retarget as retarget,
     stand_on_floor as stand_on_floor,
+)
+from ._skeletons import (
+    JOINT_MAPS as JOINT_MAPS,
+    LIMBS as LIMBS,
+    find_joint_map as find_joint_map,
+    read_joint_map as read_joint_map,
 )
 from ._source import SourceClip as SourceClip
 from ._transforms import (

@@ -38,6 +38,7 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
     values, fps = _read_motion(path, lines, motion_line, sum(map(len, channels)))
     root = np.tile(offsets[0], (len(values), 1))
     world = np.zeros((len(values), len(names), 3, 3))
+    shifts = np.tile(offsets, (len(values), 1, 1))
     at = 0
     for j, chans in enumerate(channels):
         block = values[:, at : at + len(chans)]
@@ -50,10 +51,21 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
             else np.broadcast_to(np.eye(3), (len(values), 3, 3))
         )
         for k, c in enumerate(chans):
-            if c in _SLOTS and j == 0:
-                root[:, _SLOTS[c]] = block[:, k]
+            if c in _SLOTS:
+                (root if j == 0 else shifts[:, j])[:, _SLOTS[c]] = block[:, k]
         world[:, j] = local if parents[j] < 0 else world[:, parents[j]] @ local
-    return SourceClip(tuple(names), tuple(parents), offsets, world, root, fps, path.stem, str(path))
+    moves = any(c in _SLOTS for chans in channels[1:] for c in chans)
+    return SourceClip(
+        tuple(names),
+        tuple(parents),
+        offsets,
+        world,
+        root,
+        fps,
+        path.stem,
+        str(path),
+        shifts=shifts if moves else None,
+    )
 
 
 def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:

@@ -9,12 +9,16 @@ from jaxtyping import Array, Float
 
 from ..body import Body
 from ..errors import MotionError
-from ..files import whole_file
+from ..files import read_arrays, whole_file
+from ._amass import AMASS_ARRAYS, amass_clip
 from ._asf_amc import read_amc
 from ._bvh import read_bvh
+from ._gltf import read_gltf
 from ._motion import Motion, make_motion, resample
 from ._procedural import CLIPS, procedural_clip
 from ._retarget import retarget
+from ._skeletons import read_joint_map
+from ._source import SourceClip
 
 
 def load_motion(
@@ -23,19 +27,22 @@ def load_motion(
     fps: float | int | None = None,
     source_fps: float | int | None = None,
     skeleton: str | pathlib.Path | None = None,
-    joint_map: Mapping[str, str] | None = None,
+    joint_map: Mapping[str, str] | str | pathlib.Path | None = None,
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
 ) -> Motion:
     """A motion by file or by name.
 
     Args:
-        motion: A `.bvh`, `.amc` or `.npz` file, or the name of a built-in clip.
+        motion: A file or the name of a built-in clip. Files are `.bvh`, `.amc` (with its
+            ASF), `.glb` or `.gltf` with a skin and an animation, and `.npz`: one that
+            `save_motion` wrote, or one of AMASS (SMPL, SMPL+H or SMPL-X poses).
         fps: Resample to this rate [1/s].
         source_fps: True rate of the file, where its header is wrong or silent (CMU
             subjects 60 and 61 say 120 and are 60).
         skeleton: The ASF of an AMC file.
-        joint_map: Body joint to the file's joint, for a skeleton of unknown names.
+        joint_map: Body joint to the file's joint, for a skeleton of unknown names, or
+            a file of them (`read_joint_map`).
         body: Body to retarget to; the built-in one by default.
         shape: Its shape parameters, whose proportions set how it stands and steps.
 
@@ -54,18 +61,29 @@ def load_motion(
             raise MotionError(f"{name} is {rate}, expected a positive number.")
     path = pathlib.Path(motion)
     suffix = path.suffix.lower()
+    source: SourceClip | None = None
+    clip: Motion | None = None
     if suffix == ".bvh":
-        clip = retarget(read_bvh(path), body, joint_map=joint_map, shape=shape)
+        source = read_bvh(path)
     elif suffix == ".amc":
-        clip = retarget(read_amc(path, skeleton), body, joint_map=joint_map, shape=shape)
+        source = read_amc(path, skeleton)
+    elif suffix in (".glb", ".gltf"):
+        source = read_gltf(path)
     elif suffix == ".npz":
-        clip = _load_npz(path)
+        read = _read_npz(path)
+        source, clip = (read, None) if isinstance(read, SourceClip) else (None, read)
     elif str(motion) in CLIPS:
         clip = procedural_clip(str(motion), fps=float(fps or 30), body=body, shape=shape)
     else:
         raise MotionError(
-            f"{motion}: neither a .bvh, .amc or .npz file nor a built-in clip ({', '.join(CLIPS)})."
+            f"{motion}: neither a .bvh, .amc, .glb, .gltf or .npz file nor a built-in clip"
+            f" ({', '.join(CLIPS)})."
         )
+    if source is not None:
+        if isinstance(joint_map, str | pathlib.Path):
+            joint_map = read_joint_map(joint_map)
+        clip = retarget(source, body, joint_map=joint_map, shape=shape)
+    assert clip is not None
     if source_fps is not None:
         clip = make_motion(clip.rotations, clip.root, source_fps, name=clip.name)
     return clip if fps is None or fps == clip.fps else resample(clip, fps)
@@ -82,16 +100,31 @@ def save_motion(path: str | pathlib.Path, motion: Motion) -> None:
         )
 
 
-def _load_npz(path: pathlib.Path) -> Motion:
+def _read_npz(path: pathlib.Path) -> Motion | SourceClip:
+    if not path.is_file():
+        raise MotionError.at(path, None, "no such file", "Check the path")
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-            return make_motion(data["rotations"], data["root"], float(data["fps"]), name=path.stem)
-    except MotionError:
-        raise
-    except Exception as error:
-        raise MotionError.at(
-            path,
-            None,
-            f"not a motion archive ({error})",
-            "It needs arrays rotations [frames, joints, 4], root [frames, 3] and fps",
-        ) from error
+        data = read_arrays(path, ("rotations", "root", "fps", *AMASS_ARRAYS))
+    except ValueError as error:
+        raise _not_motion(path, str(error)) from error
+    if "trans" in data:
+        return amass_clip(data, path)
+    if not {"rotations", "root", "fps"} <= data.keys() or data["fps"].size != 1:
+        raise _not_motion(path, f"it holds {', '.join(sorted(data)) or 'nothing known'}")
+    try:
+        rate = float(data["fps"].reshape(()))
+        return make_motion(data["rotations"], data["root"], rate, name=path.stem)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, MotionError):
+            raise
+        raise _not_motion(path, str(error)) from error
+
+
+def _not_motion(path: pathlib.Path, problem: str) -> MotionError:
+    return MotionError.at(
+        path,
+        None,
+        f"not a motion archive ({problem})",
+        "It needs arrays rotations [frames, joints, 4], root [frames, 3] and fps, or poses,"
+        " trans and mocap_framerate as AMASS has them",
+    )

@@ -7,87 +7,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
 
-from ..body import NUM_BODY_VERTICES, Body, align_global, load_body, smallest_rotation
+from ..body import NUM_BODY_VERTICES, Body, align_global, load_body
 from ..errors import MotionError
 from ._motion import Motion, animate, make_motion
+from ._reference import limb_directions, reference_pose, upright
+from ._skeletons import NEEDED, find_joint_map
 from ._source import SourceClip
-
-_SIDES = (("Left", "l", "L"), ("Right", "r", "R"))
-_TRUNK = ("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head")
-_ARM = ("Shoulder", "Arm", "ForeArm", "Hand")
-_LEG = ("UpLeg", "Leg", "Foot", "ToeBase")
-
-
-def _family(
-    trunk: tuple[str | None, ...], arm: tuple[str, ...], leg: tuple[str | None, ...]
-) -> dict[str, str]:
-    """Body joint to source joint; '{S}' is Left or Right, '{s}' is l or r."""
-    out = {b: s for b, s in zip(_TRUNK, trunk, strict=True) if s}
-    for side, small, _ in _SIDES:
-        for names, sources in ((_ARM, arm), (_LEG, leg)):
-            for b, s in zip(names, sources, strict=True):
-                if s:
-                    out[side + b] = s.format(S=side, s=small)
-    return out
-
-
-JOINT_MAPS: dict[str, dict[str, str]] = {
-    "cmu-asf": _family(
-        ("root", "lowerback", "upperback", "thorax", "lowerneck", "upperneck", "head"),
-        ("{s}clavicle", "{s}humerus", "{s}radius", "{s}wrist"),
-        ("{s}femur", "{s}tibia", "{s}foot", "{s}toes"),
-    ),
-    "cmu-motionbuilder": _family(
-        _TRUNK,
-        tuple("{S}" + n for n in _ARM),
-        tuple("{S}" + n for n in _LEG),
-    ),
-    "cmu-daz": _family(
-        ("hip", "abdomen", None, "chest", "neck", None, "head"),
-        ("{s}Collar", "{s}Shldr", "{s}ForeArm", "{s}Hand"),
-        ("{s}Thigh", "{s}Shin", "{s}Foot", None),
-    ),
-    "cmu-3dsmax": _family(
-        ("Hips", "lowerback", "Chest", "Chest2", "lowerneck", "Neck", "Head"),
-        ("{S}Collar", "{S}Shoulder", "{S}Elbow", "{S}Wrist"),
-        ("{S}Hip", "{S}Knee", "{S}Ankle", "{S}Toe"),
-    ),
-}
-"""Joint maps by family: body joint to source joint."""
-
-LIMBS = {
-    f"{side}{a}": f"{side}{b}"
-    for side, _, _ in _SIDES
-    for a, b in (("Arm", "ForeArm"), ("ForeArm", "Hand"), ("UpLeg", "Leg"), ("Leg", "Foot"))
-}
-"""Limb bones: joint at the start, joint at the end."""
-
-# DAZ figures hold their forearms 17 degrees forward in their T-pose.
-_T_POSE = float(np.cos(np.radians(25.0)))
-
-
-def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
-    """The family whose joints the skeleton has.
-
-    Raises:
-        MotionError: If none fits; the text lists what is missing from the nearest.
-    """
-    have = set(source.names)
-    missing = {
-        family: [s for s in joints.values() if s not in have]
-        for family, joints in JOINT_MAPS.items()
-    }
-    family = min(missing, key=lambda f: len(missing[f]))
-    if missing[family]:
-        lacks = ", ".join(missing[family][:6])
-        raise MotionError.at(
-            source.path,
-            None,
-            f"unknown joints: not one of {', '.join(JOINT_MAPS)}; the nearest,"
-            f" {family}, lacks {lacks}",
-            "Pass a joint map (joint_map={'Hips': 'your name', …})",
-        )
-    return family, JOINT_MAPS[family]
 
 
 def retarget(
@@ -101,9 +26,11 @@ def retarget(
 
     Rotations are carried over relative to a reference pose in which the source's
     limbs are known: a T-pose in frame 0 if there is one (it is dropped), else the
-    skeleton's zero pose with its legs made straight. The body is first put in that
-    pose, so its limbs then point exactly where the source's do. Positions are scaled
-    by leg length and the clip is lifted so that its lowest point touches the floor.
+    skeleton's rest pose with its legs made straight, if a person stands in it (a
+    skeleton that stands along Z is turned upright), else the frame in which the
+    person stands straightest. The body is first put in that pose, so its limbs then
+    point exactly where the source's do. Positions are scaled by leg length and the
+    clip is lifted so that its lowest point touches the floor.
 
     Args:
         source: Clip as read.
@@ -119,12 +46,11 @@ def retarget(
     """
     body = load_body() if body is None else body
     joints = dict(joint_map) if joint_map is not None else find_joint_map(source)[1]
-    needed = {"Hips", *LIMBS, *LIMBS.values()}
-    if needed - joints.keys() or joints.keys() - set(body.joint_names):
+    if NEEDED - joints.keys() or joints.keys() - set(body.joint_names):
         raise MotionError.at(
             source.path,
             None,
-            f"the joint map lacks {sorted(needed - joints.keys())} and has unknown"
+            f"the joint map lacks {sorted(NEEDED - joints.keys())} and has unknown"
             f" {sorted(joints.keys() - set(body.joint_names))}",
             f"Map at least the limbs; the body has {', '.join(body.joint_names)}",
         )
@@ -138,13 +64,16 @@ def retarget(
                 f"It has: {', '.join(source.names[:40])}",
             )
         index[b] = source.names.index(s)
-    reference, start = _reference(source, index)
+    may_have_t_pose = source.rest is None
+    source = upright(source, index)
+    reference, start, stance = reference_pose(source, index, may_have_t_pose)
     if start >= len(source.root):
         raise MotionError.at(
             source.path, None, "only a T-pose frame, no motion", "Export more frames"
         )
-    directions = _limb_directions(source, index, reference)
-    aligned = align_global(body, directions, shape)
+    directions = limb_directions(source, index, reference)
+    aligned = align_global(body, {k: stance.T @ d for k, d in directions.items()}, shape)
+    aligned = [Rotation.from_matrix(stance) * a for a in aligned]
     world = _world_rotations(body, source, index, reference, aligned, start)
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     heads = np.asarray(body.joint_positions(rest)[0], dtype=np.float64)
@@ -198,61 +127,6 @@ def _foot_vertices(body: Body) -> Bool[np.ndarray, " vertices"]:
     columns = [body.joint_names.index(n) for n in names]
     weights = np.asarray(body.weights)[:NUM_BODY_VERTICES]
     return weights[:, columns].sum(axis=1) > 0.5
-
-
-def _reference(
-    source: SourceClip, index: Mapping[str, int]
-) -> tuple[Float[np.ndarray, "bones 3 3"], int]:
-    """World rotations of the reference pose and the first frame of motion."""
-    first = source.rotations[0]
-    limbs = {k: v for k, v in index.items() if k in LIMBS and LIMBS[k] in index}
-    upright = np.abs(first[index["Hips"]] - np.eye(3)).max() < 0.1
-    if upright and len(source.root) > 1:
-        pointing = _limb_directions(source, index, first)
-        sideways = [
-            (1.0 if k.startswith("Left") else -1.0) * pointing[k][0] for k in limbs if "Arm" in k
-        ]
-        down = [-pointing[k][1] for k in limbs if "Leg" in k]
-        if min(sideways + down) > _T_POSE:
-            return first, 1
-    # The zero pose. CMU's skeletons stand astride in it: straighten each leg as one.
-    zero = np.tile(np.eye(3), (len(source.names), 1, 1))
-    pointing = _limb_directions(source, index, zero)
-    for side in ("Left", "Right"):
-        turn = smallest_rotation(pointing[f"{side}UpLeg"], np.array([0.0, -1.0, 0.0]))
-        member = {index[f"{side}UpLeg"]}
-        for j, parent in enumerate(source.parents):
-            if parent in member:
-                member.add(j)
-        for j in member:
-            zero[j] = turn.as_matrix()
-    return zero, 0
-
-
-def _limb_directions(
-    source: SourceClip,
-    index: Mapping[str, int],
-    rotations: Float[np.ndarray, "bones 3 3"],
-) -> dict[str, Float[np.ndarray, "3"]]:
-    """Unit directions of limb bones in a pose of the source skeleton."""
-    position = np.zeros((len(source.names), 3))
-    for j, parent in enumerate(source.parents):
-        if parent >= 0:
-            position[j] = position[parent] + rotations[parent] @ source.offsets[j]
-    out = {}
-    for a, b in LIMBS.items():
-        d = position[index[b]] - position[index[a]]
-        length = float(np.linalg.norm(d))
-        if length < 1e-9:
-            raise MotionError.at(
-                source.path,
-                None,
-                f"the bone from {source.names[index[a]]} to {source.names[index[b]]} has"
-                " length zero",
-                "Fix its OFFSET, or map other joints",
-            )
-        out[a] = d / length
-    return out
 
 
 def _world_rotations(

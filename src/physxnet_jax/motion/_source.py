@@ -19,6 +19,10 @@ class SourceClip:
         fps: Frames a second, as the file says.
         name: Name of the clip.
         path: Where it was read from, for errors.
+        rest: World rotation of every joint in the skeleton's rest pose, shape
+            [joints, 3, 3]; no rotation at all if omitted.
+        shifts: Position of every joint in its parent's frame where it changes, shape
+            [frames, joints, 3]; `offsets` all the time if omitted.
     """
 
     names: tuple[str, ...]
@@ -29,6 +33,8 @@ class SourceClip:
     fps: float
     name: str
     path: str
+    rest: Float[np.ndarray, "joints 3 3"] | None = None
+    shifts: Float[np.ndarray, "frames joints 3"] | None = None
 
     def positions(self) -> Float[np.ndarray, "frames joints 3"]:
         """World positions of all joints."""
@@ -37,6 +43,18 @@ class SourceClip:
             if parent < 0:
                 out[:, j] = self.root
             else:
-                step = self.rotations[:, parent] @ self.offsets[j]
+                local = self.offsets[j][None] if self.shifts is None else self.shifts[:, j]
+                step = (self.rotations[:, parent] @ local[:, :, None])[:, :, 0]
                 out[:, j] = out[:, parent] + step
         return out
+
+    def turned(self, turn: Float[np.ndarray, "3 3"]) -> "SourceClip":
+        """The same clip with the whole world rotated, its rest pose too."""
+        rest = self.rest_rotations()
+        return dataclasses.replace(
+            self, rotations=turn @ self.rotations, root=self.root @ turn.T, rest=turn @ rest
+        )
+
+    def rest_rotations(self) -> Float[np.ndarray, "joints 3 3"]:
+        """World rotations of the rest pose."""
+        return np.tile(np.eye(3), (len(self.names), 1, 1)) if self.rest is None else self.rest

@@ -82,7 +82,7 @@ def garment_map_rows(
         not in a T-pose.
 
     References:
-        PhysXNet, equation 9.
+        PhysXNet, equation 8.
     """
     mesh = chart_mesh(atlas, body, rest, garment.template)
     closed = mesh.replace(faces=_all_faces(body))
@@ -124,7 +124,7 @@ def bind(
         The binding, with counts of what had to fall back.
 
     References:
-        PhysXNet, section 4.3: T_XB.
+        PhysXNet, equation 9: T_XB.
     """
     mesh = chart_mesh(atlas, body, rest, garment.template)
     points = garment.mesh.vertices

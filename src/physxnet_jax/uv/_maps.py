@@ -45,7 +45,7 @@ def garment_map(
     cloth: Float[Array, "*batch vertices 3"],
     points: Float[Array, "*batch texels 3"],
 ) -> Float[Array, "*batch texels 3"]:
-    """I_C = T_BC M_C - I_B: offsets from skin to cloth [m] (PhysXNet, equation 9).
+    """I_C = T_BC M_C - I_B: offsets from skin to cloth [m] (PhysXNet, equation 8).
 
     Texels whose ray met no cloth are zero; see ``to_cloth.valid``.
     """

@@ -23,7 +23,7 @@ class Transference:
         valid: Whether the row means anything, shape [rows].
 
     References:
-        PhysXNet, equations 3, 5 and 9: T_CB, T_UB and T_BC.
+        PhysXNet, equations 3, 5 and 8: T_CB, T_UB and T_BC.
     """
 
     vertices: Int[Array, "rows 3"]

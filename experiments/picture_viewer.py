@@ -1,0 +1,58 @@
+"""Pictures of the viewer for the documents, from a real browser.
+
+Command: python experiments/picture_viewer.py
+Needs:   Chromium on the path.
+Cost:    two minutes.
+Result:  docs/viewer-network.png, docs/viewer-maps.png, docs/viewer-error.png.
+"""
+
+import pathlib
+import runpy
+import tempfile
+import time
+
+import imageio.v3 as iio
+import numpy as np
+
+from physxnet_jax.viewer import Choice, Viewer
+
+DOCS = pathlib.Path(__file__).parents[1] / "docs"
+_TOLD = runpy.run_path(str(DOCS.parent / "tests/browser.py"))
+# The browser's warning that it draws without a GPU says nothing of the viewer.
+_CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
+
+
+def main() -> None:
+    viewer = Viewer(Choice("walk", ("top", "bottom"), weights="small", frames=60))
+    viewer.wait()
+    viewer._playing.value = False
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        page = _TOLD["Page"](viewer.url, folder, (1280, 800))
+        page.until("document.querySelector('canvas') !== null")
+        time.sleep(8)
+
+        def shoot(name: str, frame: int, scroll: int = 0) -> None:
+            viewer.wait()
+            viewer._frame.value = frame
+            page.run(_CLOSE)
+            page.run(
+                "document.querySelectorAll('div').forEach(d => {if (d.scrollHeight >"
+                f" d.clientHeight + 50) d.scrollTop = {scroll}}})"
+            )
+            time.sleep(5)
+            iio.imwrite(DOCS / f"viewer-{name}.png", page.picture().astype(np.uint8))
+
+        shoot("network", 20)
+        viewer._worn["top"].value = viewer._worn["bottom"].value = False
+        viewer._worn["dress"].value = True
+        viewer._show_maps.value = True
+        shoot("maps", 25, 700)
+        viewer._show_maps.value = False
+        viewer._widgets["compare"].value = True
+        shoot("error", 30)
+        page.close()
+    viewer.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,52 @@
+"""`physxnet view`: the viewer, or a page of it to send."""
+
+import os
+import threading
+import webbrowser
+
+from rich.console import Console
+
+from ..viewer import Choice, Viewer, record
+from ._commands import View
+from ._progress import progress_bars
+
+
+def view(command: View, console: Console, *, over: threading.Event | None = None) -> int:
+    """Serves the page until Ctrl-C, or writes it.
+
+    Args:
+        command: What was asked for.
+        console: Where to say it.
+        over: Ends the viewer when set.
+    """
+    choice = Choice(
+        motion=command.motion,
+        wear=command.wear,
+        method=command.method,
+        weights=command.weights,
+        compare=command.compare,
+        frames=command.frames,
+        fps=command.fps,
+        joint_map=command.joint_map,
+    )
+    if command.html is not None:
+        with progress_bars(console) as progress:
+            shown = record(command.html, choice, progress)
+        size = command.html.stat().st_size / 1e6
+        console.print(shown.told.replace("* ", ""), highlight=False)
+        console.print(f"wrote {command.html} ({size:.1f} MB)", highlight=False)
+        return 0
+    viewer = Viewer(choice, host=command.host, port=command.port)
+    try:
+        console.print(f"viewer at {viewer.url}; Ctrl-C ends it", highlight=False)
+        port = viewer.server.get_port()
+        if os.environ.get("SSH_CONNECTION"):
+            console.print(f"from afar: ssh -L {port}:localhost:{port} this-machine")
+        elif command.browser:
+            webbrowser.open(viewer.url)
+        (threading.Event() if over is None else over).wait()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        viewer.close()
+    return 0

@@ -1,0 +1,149 @@
+"""Motion in the layout of AMASS: poses of the SMPL family, without any of its models."""
+
+import pathlib
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ..errors import MotionError
+from ._source import SourceClip
+
+AMASS_ARRAYS = (
+    "trans",
+    "poses",
+    "root_orient",
+    "pose_body",
+    "mocap_framerate",
+    "mocap_frame_rate",
+    "fps",
+)
+"""Arrays that are read; shapes, genders and soft tissues are not."""
+
+# Joint, its parent, and where it is from there on a person of ordinary build [m].
+_FIGURE: tuple[tuple[str, str | None, tuple[float, float, float]], ...] = (
+    ("pelvis", None, (0.0, 0.0, 0.0)),
+    ("left_hip", "pelvis", (0.07, -0.09, 0.0)),
+    ("right_hip", "pelvis", (-0.07, -0.09, 0.0)),
+    ("spine1", "pelvis", (0.0, 0.11, 0.0)),
+    ("left_knee", "left_hip", (0.0, -0.39, 0.0)),
+    ("right_knee", "right_hip", (0.0, -0.39, 0.0)),
+    ("spine2", "spine1", (0.0, 0.13, 0.0)),
+    ("left_ankle", "left_knee", (0.0, -0.41, 0.0)),
+    ("right_ankle", "right_knee", (0.0, -0.41, 0.0)),
+    ("spine3", "spine2", (0.0, 0.06, 0.0)),
+    ("left_foot", "left_ankle", (0.0, -0.06, 0.12)),
+    ("right_foot", "right_ankle", (0.0, -0.06, 0.12)),
+    ("neck", "spine3", (0.0, 0.21, 0.0)),
+    ("left_collar", "spine3", (0.08, 0.12, 0.0)),
+    ("right_collar", "spine3", (-0.08, 0.12, 0.0)),
+    ("head", "neck", (0.0, 0.08, 0.03)),
+    ("left_shoulder", "left_collar", (0.10, 0.03, 0.0)),
+    ("right_shoulder", "right_collar", (-0.10, 0.03, 0.0)),
+    ("left_elbow", "left_shoulder", (0.26, 0.0, 0.0)),
+    ("right_elbow", "right_shoulder", (-0.26, 0.0, 0.0)),
+    ("left_wrist", "left_elbow", (0.25, 0.0, 0.0)),
+    ("right_wrist", "right_elbow", (-0.25, 0.0, 0.0)),
+)
+
+
+def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceClip:
+    """A clip from the arrays of an AMASS file.
+
+    Args:
+        arrays: `trans` [frames, 3] in metres; `poses` [frames, 66 or more], axis-angle,
+            the first 22 joints as SMPL orders them, or `root_orient` [frames, 3] and
+            `pose_body` [frames, 63]; `mocap_framerate`, `mocap_frame_rate` or `fps`.
+        path: Where they are from, for errors and the name.
+
+    Returns:
+        The clip on a figure of ordinary build that stands in a T-pose at rest, Y up.
+
+    Raises:
+        MotionError: Arrays missing, of other shapes, or not finite.
+
+    Note:
+        Shape parameters are ignored, as no SMPL model is at hand to read them. A body
+        of that family leans its limbs a few degrees from an exact T-pose at rest; limbs
+        are off by as much. Which axis is up is told by how the person stands on average.
+
+    References:
+        Mahmood et al., AMASS: Archive of Motion Capture as Surface Shapes (2019).
+    """
+    poses = arrays.get("poses")
+    if poses is None and {"root_orient", "pose_body"} <= arrays.keys():
+        parts = (arrays["root_orient"], arrays["pose_body"])
+        if any(p.ndim != 2 or len(p) != len(parts[0]) for p in parts):
+            raise _broken(path, f"root_orient {parts[0].shape}, pose_body {parts[1].shape}")
+        poses = np.concatenate(parts, axis=1)
+    if poses is None:
+        raise _broken(path, "it has trans, but no poses")
+    trans = arrays["trans"]
+    joints = len(_FIGURE)
+    if poses.ndim != 2 or poses.shape[1] < 3 * joints or trans.shape != (len(poses), 3):
+        raise _broken(path, f"poses {poses.shape}, trans {trans.shape}")
+    if len(poses) == 0:
+        raise _broken(path, "no frame")
+    if any(a.dtype.kind not in "fiu" for a in (poses, trans)):
+        raise _broken(path, f"poses are {poses.dtype}, trans {trans.dtype}")
+    turns = poses[:, : 3 * joints].astype(np.float64)
+    place = trans.astype(np.float64)
+    bad = ~(np.isfinite(turns).all(axis=1) & np.isfinite(place).all(axis=1))
+    if bad.any():
+        raise MotionError.at(
+            path,
+            None,
+            f"frame {int(np.argmax(bad))} is not finite",
+            "Cut the frame out or interpolate over it",
+        )
+    names = tuple(name for name, _, _ in _FIGURE)
+    parents = tuple(names.index(p) if p else -1 for _, p, _ in _FIGURE)
+    local = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix()
+    world = _chained(local.reshape(len(turns), joints, 3, 3), parents)
+    offsets = np.array([xyz for _, _, xyz in _FIGURE])
+    up = world[:, 0, :, 1].mean(axis=0)
+    if up[2] > up[1]:
+        turn = Rotation.from_euler("X", -90, degrees=True).as_matrix()
+        world, place = turn @ world, place @ turn.T
+    return SourceClip(
+        names,
+        parents,
+        offsets,
+        world,
+        place,
+        _rate(arrays, path),
+        path.stem,
+        str(path),
+        rest=np.tile(np.eye(3), (joints, 1, 1)),
+    )
+
+
+def _chained(
+    local: Float[np.ndarray, "frames joints 3 3"], parents: tuple[int, ...]
+) -> Float[np.ndarray, "frames joints 3 3"]:
+    world = local.copy()
+    for j, parent in enumerate(parents):
+        if parent >= 0:
+            world[:, j] = world[:, parent] @ local[:, j]
+    return world
+
+
+def _rate(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> float:
+    for name in ("mocap_framerate", "mocap_frame_rate", "fps"):
+        if name in arrays and arrays[name].size == 1 and arrays[name].dtype.kind in "fiu":
+            rate = float(arrays[name].reshape(()))
+            if 1.0 <= rate <= 2000.0:
+                return rate
+            raise _broken(path, f"{name} is {rate}")
+    raise _broken(path, "no mocap_framerate")
+
+
+def _broken(path: pathlib.Path, problem: str) -> MotionError:
+    return MotionError.at(
+        path,
+        None,
+        f"not a clip of AMASS: {problem}",
+        f"Expected poses [frames, {3 * len(_FIGURE)} or more], trans [frames, 3] and"
+        " mocap_framerate",
+    )

@@ -1,0 +1,307 @@
+"""What a glTF file holds, read with bounds: accessors, nodes, animations."""
+
+import base64
+import binascii
+import pathlib
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ..errors import MissingDependencyError, MotionError
+from ._motion import slerp
+
+_MAX_BYTES = 1_000_000_000
+_MAX_NODES = 20_000
+_DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_LENGTHS = {"translation": 3, "rotation": 4, "scale": 3}
+
+
+class GltfFile:
+    """A glTF 2.0 document and its buffers.
+
+    Attributes:
+        document: As pygltflib reads it.
+        path: The file, for errors.
+        parents: Parent of every node, -1 at the top.
+        order: Nodes with parents before children.
+
+    Raises:
+        MotionError: Not glTF 2.0, truncated, nodes in a circle, references that lead
+            nowhere, buffers outside the file's folder. Nothing is downloaded.
+        MissingDependencyError: Without pygltflib.
+
+    References:
+        Khronos, glTF 2.0, sections 3.5 (nodes), 3.6 (buffers and accessors) and
+        3.11 (animations).
+    """
+
+    def __init__(self, path: str | pathlib.Path) -> None:
+        self.path = pathlib.Path(path)
+        self._buffers: dict[int, bytes] = {}
+        self.document = _parsed(self.path)
+        nodes = self.document.nodes
+        if not nodes or len(nodes) > _MAX_NODES:
+            raise self.broken(f"{len(nodes)} nodes")
+        self.parents = np.full(len(nodes), -1)
+        for n, node in enumerate(nodes):
+            for child in node.children or ():
+                child = self.index(child, nodes, "node")
+                if self.parents[child] >= 0 or child == n:
+                    raise self.broken(f"node {child} has two parents")
+                self.parents[child] = n
+        self.order = self._sorted()
+
+    def broken(self, problem: str) -> MotionError:
+        """The error to raise."""
+        return MotionError.at(self.path, None, f"damaged glTF: {problem}", "Export it again")
+
+    def index(self, value: object, of: Any, what: str) -> int:
+        """A reference, checked."""
+        if type(value) is not int or not 0 <= value < len(of or ()):
+            raise self.broken(f"{what} {value} doesn't exist")
+        return value
+
+    def accessor(self, which: object) -> np.ndarray:
+        """Values of an accessor, shape [count] or [count, width].
+
+        Integers that stand for fractions become floats.
+        """
+        document = self.document
+        a = document.accessors[self.index(which, document.accessors, "accessor")]
+        dtype, width = _DTYPES.get(a.componentType), _WIDTHS.get(a.type)
+        if dtype is None or width is None or type(a.count) is not int or a.count < 1:
+            raise self.broken(f"accessor {which} of type {a.type}, {a.componentType}, {a.count}")
+        if a.sparse is not None or a.bufferView is None:
+            raise self.broken(f"accessor {which} is sparse, which isn't read")
+        view = document.bufferViews[self.index(a.bufferView, document.bufferViews, "view")]
+        size = np.dtype(dtype).itemsize * width
+        step = view.byteStride or size
+        start = a.byteOffset or 0
+        end = start + step * (a.count - 1) + size
+        if min(start, step - size) < 0 or end > (view.byteLength or 0):
+            raise self.broken(f"accessor {which} reaches past its view")
+        first = (view.byteOffset or 0) + start
+        blob = self._buffer(view.buffer)
+        if first < 0 or first - start + (view.byteLength or 0) > len(blob):
+            raise self.broken(f"view {a.bufferView} reaches past its buffer")
+        rows = np.ndarray(
+            (a.count, width), dtype, buffer=blob, offset=first, strides=(step, size // width)
+        )
+        values = rows[:, 0] if width == 1 else rows
+        if a.normalized:
+            return np.maximum(values / np.iinfo(dtype).max, -1.0)
+        return values.copy()
+
+    def local(self, node: int) -> dict[str, Float[np.ndarray, " n"]]:
+        """Translation, rotation (xyzw) and scale of a node."""
+        told = self.document.nodes[node]
+        out = {
+            "translation": np.array(told.translation or (0.0, 0.0, 0.0), float),
+            "rotation": np.array(told.rotation or (0.0, 0.0, 0.0, 1.0), float),
+            "scale": np.array(told.scale or (1.0, 1.0, 1.0), float),
+        }
+        if told.matrix is not None:
+            m = np.array(told.matrix, float)
+            if m.shape != (16,) or not np.isfinite(m).all():
+                raise self.broken(f"the matrix of node {node}")
+            m = m.reshape(4, 4).T
+            scale = np.linalg.norm(m[:3, :3], axis=0)
+            if (scale < 1e-12).any():
+                raise self.broken(f"node {node} is scaled to nothing")
+            turn = Rotation.from_matrix(m[:3, :3] / scale).as_quat()
+            out = {"translation": m[:3, 3], "rotation": turn, "scale": scale}
+        if any(
+            out[k].shape != (_LENGTHS[k],) or not np.isfinite(out[k]).all() for k in out
+        ) or not np.linalg.norm(out["rotation"]):
+            raise self.broken(f"the place of node {node}")
+        return out
+
+    def world(
+        self, times: Float[np.ndarray, " frames"] | None = None, animation: int = 0
+    ) -> Float[np.ndarray, "frames nodes 4 4"]:
+        """World matrices of all nodes.
+
+        Args:
+            times: Times of the animation [s]; the file as it stands if omitted.
+            animation: Which one.
+        """
+        tracks = {} if times is None else self._tracks(animation)
+        at = np.zeros(1) if times is None else times
+        out = np.zeros((len(at), len(self.parents), 4, 4))
+        for n in self.order:
+            place = {k: np.tile(v, (len(at), 1)) for k, v in self.local(n).items()}
+            for kind in place.keys() & {k for m, k in tracks if m == n}:
+                keys, values, mode = tracks[n, kind]
+                place[kind] = _at(keys, values, mode, at, kind)
+            m = np.zeros((len(at), 4, 4))
+            turn = Rotation.from_quat(place["rotation"]).as_matrix()
+            m[:, :3, :3] = turn * place["scale"][:, None]
+            m[:, :3, 3] = place["translation"]
+            m[:, 3, 3] = 1.0
+            parent = self.parents[n]
+            out[:, n] = m if parent < 0 else out[:, parent] @ m
+        return out
+
+    def frame_times(self, animation: int = 0) -> tuple[Float[np.ndarray, " frames"], float]:
+        """Times of an animation's frames [s], and their rate: that of its closest keys."""
+        keys = [times for times, _, _ in self._tracks(animation).values() if len(times) > 1]
+        if not keys:
+            raise MotionError.at(
+                self.path, None, "no animation of nodes", "Export it with its animation"
+            )
+        start, end = min(float(k[0]) for k in keys), max(float(k[-1]) for k in keys)
+        step = min(float(np.median(np.diff(k))) for k in keys)
+        rate = min(max(1.0 / max(step, 1e-6), 10.0), 240.0)
+        rate = float(round(rate)) if abs(rate - round(rate)) < 0.05 else rate
+        if (end - start) * rate > 1e6:
+            raise self.broken(f"an animation of {end - start:.0f} seconds")
+        return start + np.arange(int((end - start) * rate + 1e-3) + 1) / rate, rate
+
+    def _tracks(self, animation: int) -> dict[tuple[int, str], tuple[np.ndarray, np.ndarray, str]]:
+        document = self.document
+        if not document.animations:
+            return {}
+        a = document.animations[self.index(animation, document.animations, "animation")]
+        out = {}
+        for channel in a.channels:
+            kind = channel.target.path
+            if channel.target.node is None or kind not in _LENGTHS:
+                continue
+            node = self.index(channel.target.node, document.nodes, "node")
+            sampler = a.samplers[self.index(channel.sampler, a.samplers, "sampler")]
+            times = np.asarray(self.accessor(sampler.input), float)
+            values = np.asarray(self.accessor(sampler.output), float)
+            mode = sampler.interpolation or "LINEAR"
+            rows = 3 * len(times) if mode == "CUBICSPLINE" else len(times)
+            if (
+                times.ndim != 1
+                or values.shape != (rows, _LENGTHS[kind])
+                or not (np.isfinite(times).all() and np.isfinite(values).all())
+                or (np.diff(times) < 0).any()
+            ):
+                raise self.broken(f"the keys of node {node}, {kind}")
+            out[node, kind] = (times, values, mode)
+        return out
+
+    def _buffer(self, which: object) -> bytes:
+        n = self.index(which, self.document.buffers, "buffer")
+        if n not in self._buffers:
+            uri = self.document.buffers[n].uri
+            if uri is None:
+                self._buffers[n] = self.document.binary_blob() or b""
+            elif uri.startswith("data:"):
+                try:
+                    self._buffers[n] = base64.b64decode(uri.partition(",")[2], validate=True)
+                except binascii.Error as error:
+                    raise self.broken(f"buffer {n} isn't base64") from error
+            else:
+                self._buffers[n] = self._beside(uri)
+        return self._buffers[n]
+
+    def _beside(self, uri: str) -> bytes:
+        folder = self.path.parent.resolve()
+        file = (folder / uri).resolve()
+        if ":" in uri or not file.is_relative_to(folder):
+            raise MotionError.at(
+                self.path,
+                None,
+                f"its buffer '{uri[:60]}' is outside its folder",
+                "Put it beside the file, or export a .glb; nothing else is opened",
+            )
+        if not file.is_file() or file.stat().st_size > _MAX_BYTES:
+            raise MotionError.at(
+                self.path,
+                None,
+                f"its buffer '{uri[:60]}' is missing or over 1 GB",
+                "Put it beside the file",
+            )
+        return file.read_bytes()
+
+    def _sorted(self) -> list[int]:
+        depth = np.full(len(self.parents), -1)
+        for n in range(len(self.parents)):
+            chain = []
+            while n >= 0 and depth[n] < 0:
+                if len(chain) > len(self.parents):
+                    raise self.broken("nodes in a circle")
+                chain.append(n)
+                n = int(self.parents[n])
+            base = depth[n] if n >= 0 else -1
+            for k, m in enumerate(reversed(chain)):
+                depth[m] = base + 1 + k
+        return np.argsort(depth, kind="stable").tolist()
+
+
+def _parsed(path: pathlib.Path) -> Any:
+    try:
+        import pygltflib
+    except ImportError as error:
+        raise MissingDependencyError(
+            "Reading glTF needs pygltflib: pip install 'physxnet-jax[gltf]'."
+        ) from error
+    if not path.is_file():
+        raise MotionError.at(path, None, "no such file", "Check the path")
+    if path.stat().st_size > _MAX_BYTES:
+        raise MotionError.at(path, None, "over 1 GB", "Cut the clip into shorter files")
+    binary = path.read_bytes()[:4] == b"glTF"
+    try:
+        loader = pygltflib.GLTF2()
+        document: Any = (loader.load_binary if binary else loader.load_json)(str(path))
+        version = str(document.asset.version)
+    # The library fails in as many ways as a file can be broken.
+    except Exception as error:
+        raise MotionError.at(
+            path,
+            None,
+            f"not a glTF file ({type(error).__name__}: {error})"[:300],
+            "Export it again",
+        ) from error
+    if document is None or not version.startswith("2"):
+        raise MotionError.at(path, None, f"glTF {version}", "Export it as glTF 2.0")
+    return document
+
+
+def _at(
+    times: Float[np.ndarray, " keys"],
+    values: Float[np.ndarray, "rows n"],
+    mode: str,
+    at: Float[np.ndarray, " frames"],
+    kind: str,
+) -> Float[np.ndarray, "frames n"]:
+    """A track at given times."""
+    # Later than `at` by less than a rounding error is not later.
+    low = np.clip(np.searchsorted(times, at + 1e-6, side="right") - 1, 0, len(times) - 1)
+    high = np.minimum(low + 1, len(times) - 1)
+    span = np.maximum(times[high] - times[low], 1e-9)
+    t = np.clip((at - times[low]) / span, 0.0, 1.0)[:, None]
+    if mode == "STEP":
+        out = values[low]
+    elif mode == "CUBICSPLINE":
+        keys = values.reshape(len(times), 3, -1)
+        d = span[:, None]
+        a, b = keys[low, 1], keys[high, 1]
+        va, vb = d * keys[low, 2], d * keys[high, 0]
+        out = (
+            (2 * t**3 - 3 * t**2 + 1) * a
+            + (t**3 - 2 * t**2 + t) * va
+            + (3 * t**2 - 2 * t**3) * b
+            + (t**3 - t**2) * vb
+        )
+    elif kind == "rotation":
+        out = _slerp(values[low], values[high], t)
+    else:
+        out = values[low] + t * (values[high] - values[low])
+    if kind == "rotation":
+        length = np.linalg.norm(out, axis=1, keepdims=True)
+        out = np.where(length > 1e-9, out / np.maximum(length, 1e-9), (0.0, 0.0, 0.0, 1.0))
+    return out
+
+
+def _slerp(
+    a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "n 4"], t: Float[np.ndarray, "n 1"]
+) -> Float[np.ndarray, "n 4"]:
+    unit = lambda q: q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-9)  # noqa: E731
+    return slerp(unit(a), unit(b), t)

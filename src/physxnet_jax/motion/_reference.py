@@ -1,0 +1,154 @@
+"""A pose in which it is known where a skeleton's limbs point."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from ..body import smallest_rotation
+from ..errors import MotionError
+from ._skeletons import LIMBS
+from ._source import SourceClip
+
+_BOTH = ("Left", "Right")
+# At rest a skeleton stands if its legs and trunk lean less than 45 degrees.
+_STANDING = float(np.cos(np.radians(45.0)))
+# DAZ figures hold their forearms 17 degrees forward in their T-pose.
+_T_POSE = float(np.cos(np.radians(25.0)))
+
+
+def upright(source: SourceClip, index: Mapping[str, int]) -> SourceClip:
+    """The clip with Y up, if its skeleton stands along Z at rest."""
+    if _stands(source, index, 2) and not _stands(source, index, 1):
+        return source.turned(Rotation.from_euler("X", -90, degrees=True).as_matrix())
+    return source
+
+
+def _stands(source: SourceClip, index: Mapping[str, int], axis: int) -> bool:
+    """Whether both legs point down this axis at rest, and the arms lie above them."""
+    positions = _pose_positions(source, source.rest_rotations())
+    legs = [positions[index[f"{s}Foot"]] - positions[index[f"{s}UpLeg"]] for s in _BOTH]
+    trunk = _trunk(positions, index)
+    down = min(-leg[axis] / max(np.linalg.norm(leg), 1e-9) for leg in legs)
+    return bool(down > _STANDING and trunk[axis] > _STANDING * np.linalg.norm(trunk))
+
+
+def reference_pose(
+    source: SourceClip, index: Mapping[str, int], may_have_t_pose: bool
+) -> tuple[Float[np.ndarray, "bones 3 3"], int, Float[np.ndarray, "3 3"]]:
+    """The reference pose.
+
+    Args:
+        source: The clip.
+        index: Body joint to joint of the clip.
+        may_have_t_pose: Frame 0 may be a T-pose that isn't part of the motion, as in
+            files that can't say how the skeleton rests.
+
+    Returns:
+        Its world rotations, the first frame of motion, and which way the person stands
+        in it (columns left, up, forward).
+    """
+    first = source.rotations[0]
+    limbs = {k: v for k, v in index.items() if k in LIMBS and LIMBS[k] in index}
+    rest = source.rest_rotations()
+    upright = np.abs(first[index["Hips"]] - rest[index["Hips"]]).max() < 0.1
+    if may_have_t_pose and upright and len(source.root) > 1:
+        pointing = limb_directions(source, index, first)
+        sideways = [
+            (1.0 if k.startswith("Left") else -1.0) * pointing[k][0] for k in limbs if "Arm" in k
+        ]
+        down = [-pointing[k][1] for k in limbs if "Leg" in k]
+        if min(sideways + down) > _T_POSE:
+            return first, 1, np.eye(3)
+    if not _stands(source, index, 1):
+        frame = _straightest(source, index)
+        return source.rotations[frame], 0, _stance(source.positions()[frame], index)
+    # CMU's skeletons stand astride at rest: straighten each leg as one.
+    pose = rest.copy()
+    pointing = limb_directions(source, index, pose)
+    for side in _BOTH:
+        turn = smallest_rotation(pointing[f"{side}UpLeg"], np.array([0.0, -1.0, 0.0]))
+        member = {index[f"{side}UpLeg"]}
+        for j, parent in enumerate(source.parents):
+            if parent in member:
+                member.add(j)
+        for j in member:
+            pose[j] = turn.as_matrix() @ pose[j]
+    return pose, 0, np.eye(3)
+
+
+def _straightest(source: SourceClip, index: Mapping[str, int]) -> int:
+    """The frame in which the person stands most upright on straight legs.
+
+    The turn of a limb about itself is then taken as at rest, which holds for standing.
+    """
+    p = source.positions()
+    unit = lambda d: d / np.maximum(np.linalg.norm(d, axis=-1, keepdims=True), 1e-9)  # noqa: E731
+    hips, arms = (
+        0.5 * (p[:, index[f"Left{n}"]] + p[:, index[f"Right{n}"]]) for n in ("UpLeg", "Arm")
+    )
+    upright = unit(arms - hips)[:, 1]
+    across = unit(p[:, index["LeftUpLeg"]] - p[:, index["RightUpLeg"]])
+    for side in _BOTH:
+        for a, b in (("UpLeg", "Leg"), ("Leg", "Foot")):
+            upright = upright - unit(p[:, index[side + b]] - p[:, index[side + a]])[:, 1]
+        upper = unit(p[:, index[f"{side}ForeArm"]] - p[:, index[f"{side}Arm"]])
+        lower = unit(p[:, index[f"{side}Hand"]] - p[:, index[f"{side}ForeArm"]])
+        forward = np.cross(across, np.array([0.0, 1.0, 0.0]))
+        upright = upright + (upper * lower).sum(axis=1) - np.abs((upper * forward).sum(axis=1))
+    return int(np.argmax(upright))
+
+
+def _stance(
+    positions: Float[np.ndarray, "bones 3"], index: Mapping[str, int]
+) -> Float[np.ndarray, "3 3"]:
+    """Left, up and forward of the trunk, as columns."""
+    left = positions[index["LeftUpLeg"]] - positions[index["RightUpLeg"]]
+    up = _trunk(positions, index)
+    left, up = left / np.linalg.norm(left), up / np.linalg.norm(up)
+    left = left - (left @ up) * up
+    left = left / np.linalg.norm(left)
+    return np.stack([left, up, np.cross(left, up)], axis=1)
+
+
+def _trunk(
+    positions: Float[np.ndarray, "bones 3"], index: Mapping[str, int]
+) -> Float[np.ndarray, "3"]:
+    hips, arms = (
+        positions[index[f"Left{n}"]] + positions[index[f"Right{n}"]] for n in ("UpLeg", "Arm")
+    )
+    return 0.5 * (arms - hips)
+
+
+def _pose_positions(
+    source: SourceClip, rotations: Float[np.ndarray, "bones 3 3"]
+) -> Float[np.ndarray, "bones 3"]:
+    position = np.zeros((len(source.names), 3))
+    for j, parent in enumerate(source.parents):
+        if parent >= 0:
+            position[j] = position[parent] + rotations[parent] @ source.offsets[j]
+    return position
+
+
+def limb_directions(
+    source: SourceClip,
+    index: Mapping[str, int],
+    rotations: Float[np.ndarray, "bones 3 3"],
+) -> dict[str, Float[np.ndarray, "3"]]:
+    """Unit directions of limb bones in a pose of the source skeleton."""
+    position = _pose_positions(source, rotations)
+    out = {}
+    for a, b in LIMBS.items():
+        d = position[index[b]] - position[index[a]]
+        length = float(np.linalg.norm(d))
+        if length < 1e-9:
+            raise MotionError.at(
+                source.path,
+                None,
+                f"the bone from {source.names[index[a]]} to {source.names[index[b]]} has"
+                " length zero",
+                "Fix its OFFSET, or map other joints",
+            )
+        out[a] = d / length
+    return out

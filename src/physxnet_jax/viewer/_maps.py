@@ -1,0 +1,81 @@
+"""The network's maps as pictures."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt8
+
+from ..models import Predictor, clip_features
+
+
+def texel_picture(
+    values: Float[np.ndarray, "texels 3"], texels: Int[np.ndarray, " texels"], resolution: int
+) -> UInt8[np.ndarray, "height width 3"]:
+    """A map of three channels as a picture: zero is grey, empty texels are white.
+
+    Args:
+        values: Its covered texels.
+        texels: Where they are, row by row.
+        resolution: Texels a side.
+    """
+    scale = max(float(np.quantile(np.abs(values), 0.98)), 1e-9)
+    flat = np.full((resolution * resolution, 3), 255, np.uint8)
+    flat[texels] = (127 + 120 * np.clip(values / scale, -1, 1)).astype(np.uint8)
+    return flat.reshape(resolution, resolution, 3)
+
+
+def frame_maps(
+    predictor: Predictor,
+    world: Float[Array, "window joints 3 3"],
+    shift: Float[Array, "window joints 3"],
+    fps: float,
+    templates: Sequence[str],
+) -> dict[str, UInt8[np.ndarray, "height width 3"]]:
+    """What the network sees of a frame and what it answers, as pictures.
+
+    Args:
+        predictor: The network.
+        world: World rotations of joints, the window's last frame being the one shown.
+        shift: World translations of joints [m].
+        fps: Frames a second.
+        templates: Which garments' maps.
+
+    Returns:
+        Pictures by name: velocity, acceleration, then an offset map for each template.
+    """
+    inputs = predictor.config.inputs
+    seen, told = _maps(predictor, world, shift, fps, tuple(dict.fromkeys(templates)))
+    texels = np.asarray(predictor.atlas.texels)
+    out, start = {}, 0
+    for kind in inputs.kinds:
+        width = inputs.width(kind)
+        if kind in ("velocity", "acceleration"):
+            # The last of the window's frames is the one shown.
+            last = np.asarray(seen)[:, start + width - 3 : start + width]
+            out[kind] = texel_picture(last, texels, predictor.config.resolution)
+        start += width
+    for name, offsets in told.items():
+        out[name] = texel_picture(np.asarray(offsets), texels, predictor.config.resolution)
+    return out
+
+
+@functools.partial(jax.jit, static_argnames=("fps", "templates"))
+def _maps(
+    predictor: Predictor, world: Array, shift: Array, fps: float, templates: tuple[str, ...]
+) -> Any:
+    surface = predictor.surface
+    seen = clip_features(surface.rest, surface.weights, world, shift, fps, predictor.config.inputs)[
+        0
+    ]
+    return seen, jax.tree.map(lambda x: x[0], predictor(world, shift, fps, templates))
+
+
+def magnified(
+    picture: UInt8[np.ndarray, "height width 3"], size: int
+) -> UInt8[np.ndarray, "size size 3"]:
+    """The picture at another size, texels as squares."""
+    pick = np.arange(size) * len(picture) // size
+    return picture[pick][:, pick]

@@ -1,0 +1,105 @@
+"""A dressed clip on a viser scene: bodies by their bones, garments by their vertices."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from scipy.spatial.transform import Rotation
+
+from ..body import NUM_BODY_VERTICES, load_body
+from ..io import AnimatedMesh
+from ._job import Shown
+
+BESIDE = np.array([-1.1, 0.0, 0.0], np.float32)
+"""Where the reference stands [m]."""
+
+FARTHEST = 0.06
+"""Distance that is shown in the strongest colour [m]."""
+
+_SKIN = (176, 117, 84)
+
+
+class Stage:
+    """What is on a scene, moved from frame to frame.
+
+    Attributes:
+        shown: The clip.
+    """
+
+    def __init__(self, scene: Any, shown: Shown) -> None:
+        self.shown = shown
+        self._scene = scene
+        self._bodies = [self._body("body")]
+        self._meshes = [(m, np.zeros(3, np.float32), self._mesh(m, "")) for m in shown.garments]
+        self._dots = {}
+        if shown.reference:
+            self._bodies.append(self._body("reference/body"))
+            self._meshes += [(m, BESIDE, self._mesh(m, "reference/")) for m in shown.reference]
+        for m in shown.garments:
+            if m.name in shown.distances:
+                self._dots[m.name] = scene.add_point_cloud(
+                    f"/distance/{m.name}",
+                    m.positions[0],
+                    heat(shown.distances[m.name][0]),
+                    point_size=0.011,
+                    point_shape="circle",
+                )
+        self.show(0)
+
+    def show(self, frame: int) -> None:
+        """Moves all to a frame."""
+        shown = self.shown
+        turns = Rotation.from_matrix(shown.world[frame]).as_quat(scalar_first=True)
+        for place, body in zip((0.0 * BESIDE, BESIDE), self._bodies, strict=False):
+            for bone, q, p in zip(body.bones, turns, shown.shift[frame] + place, strict=True):
+                bone.wxyz, bone.position = q, p
+        for mesh, place, handle in self._meshes:
+            handle.vertices = mesh.positions[frame] + place
+        for mesh in shown.garments:
+            if mesh.name in self._dots:
+                dots = self._dots[mesh.name]
+                dots.points = mesh.positions[frame]
+                dots.colors = heat(shown.distances[mesh.name][frame])
+
+    def clear(self) -> None:
+        """Takes all off the scene."""
+        for handle in (*self._bodies, *(h for _, _, h in self._meshes), *self._dots.values()):
+            handle.remove()
+
+    def _body(self, name: str) -> Any:
+        body = load_body()
+        joints = len(body.parents)
+        return self._scene.add_mesh_skinned(
+            f"/{name}",
+            np.asarray(self.shown.rest[:NUM_BODY_VERTICES], np.float32),
+            np.asarray(body.rest_mesh().faces).astype(np.uint32),
+            bone_wxyzs=np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (joints, 1)),
+            bone_positions=np.zeros((joints, 3)),
+            skin_weights=np.asarray(body.weights[:NUM_BODY_VERTICES]),
+            color=_SKIN,
+        )
+
+    def _mesh(self, mesh: AnimatedMesh, folder: str) -> Any:
+        # Display colours are linear, a browser's aren't.
+        colour = tuple(int(255 * c ** (1 / 2.2)) for c in mesh.colour)
+        if mesh.name in self.shown.distances and not folder:
+            colour = (205, 205, 205)
+        return self._scene.add_mesh_simple(
+            f"/{folder}{mesh.name}",
+            np.asarray(mesh.positions[0], np.float32),
+            np.asarray(mesh.faces).astype(np.uint32),
+            color=colour,
+            side="double",
+        )
+
+
+def heat(distances: Float[np.ndarray, " vertices"]) -> UInt8[np.ndarray, "vertices 3"]:
+    """Blue for no distance, through white, to red at `FARTHEST`."""
+    t = np.clip(distances / FARTHEST, 0.0, 1.0)[:, None]
+    low, middle, high = (
+        np.array([[40, 80, 200]]),
+        np.array([[245, 245, 245]]),
+        np.array([[200, 30, 30]]),
+    )
+    colour = np.where(t < 0.5, low + 2 * t * (middle - low), middle + (2 * t - 1) * (high - middle))
+    return colour.astype(np.uint8)

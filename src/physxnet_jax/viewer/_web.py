@@ -1,0 +1,415 @@
+"""The viewer in a browser: choose, watch, compare, take away."""
+
+import contextlib
+import dataclasses
+import io
+import logging
+import pathlib
+import re
+import tempfile
+import threading
+import time
+import traceback
+import zipfile
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from ..body import load_body
+from ..errors import FormatError, MissingDependencyError, PhysXNetError
+from ..files import whole_file
+from ..garment import FABRICS, TEMPLATES
+from ..io import EXTENSIONS, list_weights, write_clip
+from ..motion import CLIPS
+from ..simulation import ACCURACY
+from ._job import Choice, Shown, carry_out
+from ._maps import magnified
+from ._stage import Stage
+
+_METHODS = ("network", "lbs", "simulate")
+_MOTIONS = (".bvh", ".amc", ".npz", ".glb", ".gltf")
+_MAP_SIZE = 192
+
+
+class _Superseded(Exception):
+    """Something else has been chosen meanwhile."""
+
+
+class Viewer:
+    """A web page on which a person is dressed.
+
+    The page is one for all who look at it. What is chosen is computed in the background,
+    the latest choice first; what was shown stays until the new one is ready.
+
+    Args:
+        choice: What is shown at first.
+        host: Address to listen at; by default only this machine can connect.
+        port: Port to listen at; the next free one is taken.
+
+    Raises:
+        MissingDependencyError: Without the ``viewer`` extra.
+    """
+
+    def __init__(self, choice: Choice, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        self.server = _server(host, port)
+        self.shown: Shown | None = None
+        self._stage: Stage | None = None
+        self._lock = threading.RLock()
+        self._wanted: Choice | None = None
+        self._news = threading.Event()
+        self._over = threading.Event()
+        self._folder = tempfile.TemporaryDirectory(prefix="physxnet-view-")
+        self._files: dict[str, pathlib.Path] = {}
+        self._first = choice
+        self._pictures: dict[str, Any] = {}
+        self._build(choice)
+        self._threads = [
+            threading.Thread(target=run, daemon=True) for run in (self._work, self._play)
+        ]
+        for thread in self._threads:
+            thread.start()
+        self.ask()
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def chosen(self) -> Choice:
+        """What the page's controls say."""
+        w = self._widgets
+        body = load_body()
+        ordinary = dict(zip(body.shape_names, np.asarray(body.default_shape()), strict=True))
+        shape = tuple(
+            (name, float(handle.value))
+            for name, handle in self._shapes.items()
+            if abs(handle.value - ordinary[name]) > 1e-6
+        )
+        motion = str(w["motion"].value)
+        return dataclasses.replace(
+            self._first,
+            motion=str(self._files.get(motion, motion)),
+            wear=tuple(
+                str(self._files.get(name, name)) for name, box in self._worn.items() if box.value
+            ),
+            method=w["method"].value,
+            weights=w["weights"].value,
+            push_out=w["push_out"].value,
+            compare=w["compare"].value,
+            shape=shape,
+            accuracy=w["accuracy"].value,
+            fabric=None if w["fabric"].value == "as cut" else w["fabric"].value,
+            wind=(float(w["wind_x"].value), 0.0, float(w["wind_z"].value)),
+            self_contact=w["self_contact"].value,
+            frames=int(w["frames"].value),
+        )
+
+    def ask(self) -> None:
+        """Has what is chosen computed."""
+        with self._lock:
+            self._wanted = self.chosen()
+            self._news.set()
+
+    def wait(self, seconds: float = 600.0) -> Shown:
+        """Waits until what is chosen is shown.
+
+        Raises:
+            PhysXNetError: What went wrong, or that it takes too long.
+        """
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            with self._lock:
+                if self._wanted is None and not self._news.is_set():
+                    if self._failed is not None:
+                        raise self._failed
+                    if self.shown is not None:
+                        return self.shown
+            time.sleep(0.02)
+        raise PhysXNetError(f"Nothing to show after {seconds:g} seconds.")
+
+    def add_file(self, name: str, content: bytes) -> None:
+        """A motion or a garment that was dropped in.
+
+        Raises:
+            FormatError: Another kind of file.
+        """
+        # Only the last part, in plain characters: a name from the net is no path.
+        name = re.sub(r"[^\w.-]", "_", pathlib.PurePosixPath(name.replace("\\", "/")).name)
+        suffix = pathlib.Path(name).suffix.lower()
+        if suffix not in (*_MOTIONS, ".obj", ".asf") or name.startswith("."):
+            raise FormatError(f"{name}: not a motion ({', '.join(_MOTIONS)}) nor a garment (.obj).")
+        path = pathlib.Path(self._folder.name) / name
+        with whole_file(path) as part:
+            part.write_bytes(content)
+        if suffix == ".asf":
+            return
+        self._files[name] = path
+        if suffix == ".obj":
+            with self._clothes:
+                self._add_garment(name, True)
+        else:
+            menu = self._widgets["motion"]
+            menu.options = tuple(dict.fromkeys((*menu.options, name)))
+            menu.value = name
+        self.ask()
+
+    def export(self, suffix: str) -> tuple[str, bytes]:
+        """What is shown as a file of this format; several as one archive.
+
+        Returns:
+            Name and content.
+        """
+        shown = self.wait()
+        with tempfile.TemporaryDirectory() as folder:
+            name = pathlib.Path(shown.choice.motion).stem.replace(" ", "_")
+            out = pathlib.Path(folder) / f"{name}{suffix}"
+            written = write_clip(out, shown.meshes(), shown.clip.fps)
+            if len(written) == 1:
+                return written[0].name, written[0].read_bytes()
+            archive = pathlib.Path(folder) / f"{name}.zip"
+            with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED) as file:
+                for path in written:
+                    file.write(path, path.name)
+            return archive.name, archive.read_bytes()
+
+    def close(self) -> None:
+        """Ends the page and what is being computed."""
+        self._over.set()
+        self._news.set()
+        for thread in self._threads:
+            thread.join(timeout=30.0)
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+        self._folder.cleanup()
+
+    def _build(self, choice: Choice) -> None:
+        server = self.server
+        gui = server.gui
+        gui.configure_theme(control_width="large", dark_mode=False)
+        gui.set_panel_label("physxnet")
+        self._status = gui.add_markdown("loading …")
+        self._failed: PhysXNetError | None = None
+        w: dict[str, Any] = {}
+        with gui.add_folder("Motion"):
+            there = tuple(CLIPS)
+            if choice.motion not in there:
+                name = pathlib.Path(choice.motion).name
+                self._files[name] = pathlib.Path(choice.motion)
+                there, first = (*there, name), name
+            else:
+                first = choice.motion
+            w["motion"] = gui.add_dropdown("clip", there, initial_value=first)
+            w["frames"] = gui.add_slider(
+                "frames at most", 1, max(600, choice.frames), 1, choice.frames
+            )
+            upload = gui.add_upload_button("add motion or garment")
+        self._clothes = gui.add_folder("Garments")
+        self._worn: dict[str, Any] = {}
+        with self._clothes:
+            for name in dict.fromkeys((*TEMPLATES, *choice.wear)):
+                short = name
+                if name not in TEMPLATES:
+                    short = pathlib.Path(name).name
+                    self._files[short] = pathlib.Path(name)
+                self._add_garment(short, name in choice.wear)
+        with gui.add_folder("Cloth"):
+            w["method"] = gui.add_dropdown("method", _METHODS, initial_value=choice.method)
+            w["weights"] = gui.add_dropdown(
+                "network", tuple(list_weights()), initial_value=choice.weights
+            )
+            w["push_out"] = gui.add_checkbox("push out of the body", choice.push_out)
+            w["compare"] = gui.add_checkbox("simulation beside it", choice.compare)
+        with gui.add_folder("When simulating", expand_by_default=False):
+            w["accuracy"] = gui.add_dropdown(
+                "accuracy", tuple(ACCURACY), initial_value=choice.accuracy
+            )
+            w["fabric"] = gui.add_dropdown(
+                "fabric", ("as cut", *FABRICS), initial_value=choice.fabric or "as cut"
+            )
+            w["wind_x"] = gui.add_slider("wind from the right, m/s", -10.0, 10.0, 0.5, 0.0)
+            w["wind_z"] = gui.add_slider("wind from behind, m/s", -10.0, 10.0, 0.5, 0.0)
+            w["self_contact"] = gui.add_checkbox("self-contact", choice.self_contact)
+        self._shapes: dict[str, Any] = {}
+        body, told = load_body(), dict(choice.shape)
+        with gui.add_folder("Body", expand_by_default=False):
+            for name, x in zip(body.shape_names, np.asarray(body.default_shape()), strict=True):
+                self._shapes[name] = gui.add_slider(
+                    name.replace("_", " "), 0.0, 1.0, 0.05, round(told.get(name, float(x)), 2)
+                )
+        with gui.add_folder("Play"):
+            self._playing = gui.add_checkbox("play", True)
+            self._frame = gui.add_slider("frame", 0, max(choice.frames - 1, 1), 1, 0)
+            self._show_maps = gui.add_checkbox("maps of the network", False)
+            self._maps_folder = gui.add_folder("Maps", visible=False)
+        with gui.add_folder("Take away"):
+            kind = gui.add_dropdown("format", tuple(EXTENSIONS), initial_value=".usdc")
+            take = gui.add_button("export")
+        self._widgets = w
+        for handle in (*w.values(), *self._shapes.values()):
+            handle.on_update(lambda _: self.ask())
+        self._frame.on_update(lambda _: self._show_frame())
+        self._show_maps.on_update(lambda _: self._show_frame())
+
+        @upload.on_upload
+        def _(event: Any) -> None:
+            with self._telling():
+                self.add_file(event.target.value.name, event.target.value.content)
+
+        @take.on_click
+        def _(event: Any) -> None:
+            take.disabled = True
+            try:
+                with self._telling():
+                    event.client.send_file_download(*self.export(kind.value))
+            finally:
+                take.disabled = False
+
+    def _add_garment(self, name: str, worn: bool) -> None:
+        if name in self._worn:
+            self._worn[name].value = worn
+            return
+        box = self.server.gui.add_checkbox(name, worn)
+        box.on_update(lambda _: self.ask())
+        self._worn[name] = box
+
+    @contextlib.contextmanager
+    def _telling(self) -> Iterator[None]:
+        """Errors of what the user asked for are shown on the page."""
+        try:
+            yield
+        except (PhysXNetError, OSError) as error:
+            self._status.content = f"**{error}**"
+
+    def _work(self) -> None:
+        while True:
+            self._news.wait()
+            if self._over.is_set():
+                return
+            with self._lock:
+                self._news.clear()
+                choice = self._wanted
+            if choice is None:
+                continue
+            failed: PhysXNetError | None = None
+            try:
+                shown = carry_out(choice, self._tick)
+                self._put(shown)
+                self._status.content = shown.told
+            except _Superseded:
+                continue
+            except PhysXNetError as error:
+                failed = error
+            except Exception as error:
+                traceback.print_exc()
+                failed = PhysXNetError(f"{type(error).__name__}: {error}")
+            if failed is not None:
+                self._status.content = f"**{failed}**"
+            with self._lock:
+                self._failed = failed
+                if not self._news.is_set():
+                    self._wanted = None
+
+    def _tick(self, stage: str, done: int, total: int) -> None:
+        if self._news.is_set() or self._over.is_set():
+            raise _Superseded
+        self._status.content = f"{stage}: {done} of {total} frames …"
+
+    def _put(self, shown: Shown) -> None:
+        with self._lock, self.server.atomic():
+            if self._stage is not None:
+                self._stage.clear()
+            self.shown, self._stage = shown, Stage(self.server.scene, shown)
+            self._frame.max = max(shown.num_frames - 1, 1)
+            self._show_frame()
+
+    def _show_frame(self) -> None:
+        with self._lock:
+            if self._stage is None or self.shown is None:
+                return
+            frame = min(int(self._frame.value), self.shown.num_frames - 1)
+            with self.server.atomic():
+                self._stage.show(frame)
+            # While playing only now and then: they cost more than the frame.
+            if self._show_maps.value != self._maps_folder.visible:
+                self._maps_folder.visible = self._show_maps.value
+            if self._show_maps.value and (not self._playing.value or frame % 10 == 0):
+                self._draw_maps(self.shown, frame)
+
+    def _draw_maps(self, shown: Shown, frame: int) -> None:
+        worn = tuple(t for t in TEMPLATES if t in {n for n, box in self._worn.items() if box.value})
+        for name, picture in shown.maps(frame, worn or TEMPLATES).items():
+            picture = magnified(picture, _MAP_SIZE)
+            if name in self._pictures:
+                self._pictures[name].image = picture
+            else:
+                with self._maps_folder:
+                    self._pictures[name] = self.server.gui.add_image(picture, label=name)
+
+    def _play(self) -> None:
+        due = time.monotonic()
+        while not self._over.is_set():
+            shown = self.shown
+            if shown is None or not self._playing.value or not self.server.get_clients():
+                self._over.wait(0.1)
+                due = time.monotonic()
+                continue
+            # Setting the slider shows the frame.
+            self._frame.value = (int(self._frame.value) + 1) % shown.num_frames
+            due = max(due + 1.0 / shown.clip.fps, time.monotonic() - 1.0)
+            self._over.wait(max(due - time.monotonic(), 0.0))
+
+
+def record(
+    path: str | pathlib.Path,
+    choice: Choice,
+    progress: Callable[[str, int, int], None] | None = None,
+) -> Shown:
+    """Writes what is chosen as one page that plays by itself.
+
+    Args:
+        path: ``.html``; written whole or not at all.
+        choice: What is shown.
+        progress: Called with a stage, frames done and frames in all.
+
+    Raises:
+        FormatError: The path doesn't end in ``.html``.
+        PhysXNetError: Anything that can't be read, bound or worn.
+        MissingDependencyError: Without the ``viewer`` extra.
+    """
+    if pathlib.Path(path).suffix.lower() != ".html":
+        raise FormatError(f"{path}: the page is written as .html.")
+    shown = carry_out(choice, progress)
+    server = _server("127.0.0.1", 8090)
+    try:
+        stage = Stage(server.scene, shown)
+        tape = server.get_scene_serializer()
+        for frame in range(shown.num_frames):
+            stage.show(frame)
+            tape.insert_sleep(1.0 / shown.clip.fps)
+        text = tape.as_html()
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
+    with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return shown
+
+
+def _server(host: str, port: int) -> Any:
+    try:
+        import viser
+    except ImportError as error:
+        raise MissingDependencyError(
+            "The viewer needs viser: pip install 'physxnet-jax[viewer]'."
+        ) from error
+    # A browser that goes away while connecting is nothing to report.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+    # It prints a banner whatever it is told.
+    with contextlib.redirect_stdout(io.StringIO()):
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    server.scene.set_up_direction("+y")
+    server.scene.add_grid("/floor", width=12.0, height=12.0, plane="xz", cell_size=0.5)
+    server.initial_camera.position = (1.1, 1.3, 2.7)
+    server.initial_camera.look_at = (0.1, 0.85, 0.0)
+    return server

@@ -1,0 +1,288 @@
+"""Motion from glTF and AMASS files, against the clip they were made from."""
+
+import json
+
+import numpy as np
+import pygltflib
+import pytest
+from hypothesis import HealthCheck, given, settings, strategies as st
+from scipy.spatial.transform import Rotation
+
+from physxnet_jax.errors import MotionError
+from physxnet_jax.motion import (
+    JOINT_MAPS,
+    LIMBS,
+    clip_transforms,
+    load_motion,
+    procedural_clip,
+    read_gltf,
+)
+
+
+def write_gltf(path, body, rest, motion, mode="LINEAR", scale=0.01):
+    """The motion as Mixamo joints under an armature node that scales and turns."""
+    names = JOINT_MAPS["mixamo"]
+    world, shift = (np.asarray(x, np.float64) for x in clip_transforms(body, rest, motion))
+    heads = np.asarray(body.joint_positions(rest)[0], np.float64)
+    chosen = [b for b in body.joint_names if b in names]
+    index = body.joint_names.index
+    parent = {}
+    for b in chosen:
+        j = body.parents[index(b)]
+        while j >= 0 and body.joint_names[j] not in names:
+            j = body.parents[j]
+        parent[b] = body.joint_names[j] if j >= 0 else None
+    turn = Rotation.from_euler("X", 90, degrees=True).as_matrix()
+    root = np.einsum("fab,b->fa", world[:, 0], heads[0]) + shift[:, 0]
+    g = pygltflib.GLTF2(scene=0, scenes=[pygltflib.Scene(nodes=[0])])
+    g.nodes.append(
+        pygltflib.Node(
+            name="Armature",
+            children=[1],
+            scale=[scale] * 3,
+            rotation=Rotation.from_matrix(turn.T).as_quat().tolist(),
+        )
+    )
+    blob = bytearray()
+
+    def put(values, kind):
+        values = np.ascontiguousarray(values, np.float32)
+        g.bufferViews.append(
+            pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=values.nbytes)
+        )
+        g.accessors.append(
+            pygltflib.Accessor(
+                bufferView=len(g.bufferViews) - 1, componentType=5126, count=len(values), type=kind
+            )
+        )
+        blob.extend(values.tobytes())
+        return len(g.accessors) - 1
+
+    frames = len(root)
+    times = put(np.arange(frames) / motion.fps, "SCALAR")
+    channels, samplers = [], []
+
+    def track(node, kind, values):
+        if mode == "CUBICSPLINE":
+            slope = np.gradient(values, axis=0) * motion.fps
+            values = np.stack([slope, values, slope], axis=1).reshape(3 * frames, -1)
+        out = put(values, "VEC4" if kind == "rotation" else "VEC3")
+        samplers.append(pygltflib.AnimationSampler(input=times, output=out, interpolation=mode))
+        target = pygltflib.AnimationChannelTarget(node=node, path=kind)
+        channels.append(pygltflib.AnimationChannel(sampler=len(samplers) - 1, target=target))
+
+    for k, b in enumerate(chosen, start=1):
+        mother = parent[b]
+        offset = heads[index(b)] - (heads[index(mother)] if mother else 0.0)
+        if mother is None:
+            offset = turn @ offset
+            local = turn @ world[:, 0]
+        else:
+            local = np.swapaxes(world[:, index(mother)], 1, 2) @ world[:, index(b)]
+        kids = [chosen.index(c) + 1 for c in chosen if parent[c] == b]
+        g.nodes.append(
+            pygltflib.Node(
+                name="mixamorig:" + names[b],
+                children=kids,
+                translation=(offset / scale).tolist(),
+                rotation=Rotation.from_matrix(turn).as_quat().tolist() if mother is None else None,
+            )
+        )
+        q = Rotation.from_matrix(local).as_quat()
+        sign = np.cumprod(np.where((q[1:] * q[:-1]).sum(1) < 0, -1.0, 1.0))
+        q[1:] *= sign[:, None]
+        track(k, "rotation", q)
+        if mother is None:
+            track(k, "translation", root @ turn.T / scale)
+    g.skins.append(pygltflib.Skin(joints=list(range(1, len(chosen) + 1))))
+    g.animations.append(pygltflib.Animation(channels=channels, samplers=samplers))
+    uri = None
+    if path.suffix == ".gltf":
+        uri = path.stem + ".bin"
+        path.with_suffix(".bin").write_bytes(bytes(blob))
+    else:
+        g.set_binary_blob(bytes(blob))
+    g.buffers.append(pygltflib.Buffer(byteLength=len(blob), uri=uri))
+    g.save(str(path))
+    return path
+
+
+def limbs_apart(body, rest, a, b):
+    """Largest angle between limbs of two clips [degrees]."""
+    at = []
+    for motion in (a, b):
+        world, shift = (np.asarray(x) for x in clip_transforms(body, rest, motion))
+        heads = np.asarray(body.joint_positions(rest)[0])
+        at.append(np.einsum("fjab,jb->fja", world, heads) + shift)
+    worst = 0.0
+    for p, q in LIMBS.items():
+        d, e = (x[:, body.joint(q)] - x[:, body.joint(p)] for x in at)
+        cosine = (d * e).sum(1) / np.linalg.norm(d, axis=1) / np.linalg.norm(e, axis=1)
+        worst = max(worst, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max()))
+    return worst
+
+
+@pytest.mark.parametrize("mode", ["LINEAR", "CUBICSPLINE", "STEP"])
+@pytest.mark.parametrize("suffix", [".glb", ".gltf"])
+def test_a_walk_through_gltf_is_the_same_walk(body, rest, tmp_path, mode, suffix):
+    walk = procedural_clip("walk", fps=30.0)
+    again = load_motion(write_gltf(tmp_path / f"walk{suffix}", body, rest, walk, mode))
+    assert again.num_frames == walk.num_frames and again.fps == 30.0
+    assert limbs_apart(body, rest, walk, again) < 0.2
+    np.testing.assert_allclose(again.root, walk.root, atol=0.01)
+
+
+def test_between_keys_linear_tracks_are_turned_evenly(body, rest, tmp_path):
+    slow = procedural_clip("walk", fps=10.0)
+    path = write_gltf(tmp_path / "walk.glb", body, rest, slow)
+    from physxnet_jax.motion._gltf_file import GltfFile
+
+    file = GltfFile(path)
+    times, fps = file.frame_times()
+    assert fps == 10.0
+    a, middle, b = file.world(np.array([times[3], times[3] + 0.05, times[4]]))[:, 5, :3, :3]
+    whole, half = (Rotation.from_matrix(a.T / 1e-4 @ x).magnitude() for x in (b, middle))
+    assert half == pytest.approx(0.5 * whole, rel=0.05)
+
+
+BROKEN = {
+    "no glTF": lambda d, b: (b"hello", None),
+    "empty": lambda d, b: (b"", None),
+    "truncated": lambda d, b: (None, b[: len(b) // 2]),
+    "header alone": lambda d, b: (None, b[:12]),
+    "circle": lambda d, b: (d["nodes"][5].update(children=[1]) or d, b),
+    "own parent": lambda d, b: (d["nodes"][0].update(children=[0]) or d, b),
+    "missing node": lambda d, b: (d["nodes"][0].update(children=[999]) or d, b),
+    "huge count": lambda d, b: (d["accessors"][0].update(count=10**9) or d, b),
+    "negative count": lambda d, b: (d["accessors"][0].update(count=-3) or d, b),
+    "negative offset": lambda d, b: (d["bufferViews"][1].update(byteOffset=-64) or d, b),
+    "view past its buffer": lambda d, b: (d["bufferViews"][1].update(byteLength=10**9) or d, b),
+    "wild view": lambda d, b: (d["accessors"][0].update(bufferView=-1) or d, b),
+    "wild type": lambda d, b: (d["accessors"][0].update(componentType=7) or d, b),
+    "path out": lambda d, b: (d["buffers"][0].update(uri="../../secret.bin") or d, b),
+    "absolute path": lambda d, b: (d["buffers"][0].update(uri="/etc/passwd") or d, b),
+    "web address": lambda d, b: (d["buffers"][0].update(uri="https://example.org/a.bin") or d, b),
+    "no base64": lambda d, b: (
+        d["buffers"][0].update(uri="data:application/octet-stream;base64,!!") or d,
+        b,
+    ),
+    "no animation": lambda d, b: (d.pop("animations") and d, b),
+    "missing joint": lambda d, b: (d["skins"][0].update(joints=[1, 400]) or d, b),
+    "scaled to nothing": lambda d, b: (d["nodes"][0].update(scale=[0, 0, 0]) or d, b),
+    "NaN": lambda d, b: (d, b[:4] + np.float32(np.nan).tobytes() + b[8:]),
+    "version 1": lambda d, b: (d["asset"].update(version="1.0") or d, b),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_broken_gltf_files_are_refused(body, rest, tmp_path, name):
+    (tmp_path / "secret.bin").write_bytes(b"secret" * 100)
+    folder = tmp_path / "a" / "b"
+    folder.mkdir(parents=True)
+    path = write_gltf(folder / "walk.glb", body, rest, procedural_clip("walk", fps=10.0))
+    blob = path.read_bytes()
+    size = int.from_bytes(blob[12:16], "little")
+    document, binary = json.loads(blob[20 : 20 + size]), blob[28 + size :]
+    changed, kept = BROKEN[name](document, binary)
+    if isinstance(changed, bytes):
+        path.write_bytes(changed)
+    elif changed is None:
+        path.write_bytes(blob[: len(blob) // 2] if name == "truncated" else kept[:12])
+    else:
+        text = json.dumps(changed).encode()
+        text += b" " * (-len(text) % 4)
+        head = b"glTF" + (2).to_bytes(4, "little")
+        chunks = len(text).to_bytes(4, "little") + b"JSON" + text
+        chunks += len(kept).to_bytes(4, "little") + b"BIN\0" + kept
+        path.write_bytes(head + (12 + len(chunks)).to_bytes(4, "little") + chunks)
+    with pytest.raises(MotionError, match=r"walk\.glb") as error:
+        load_motion(path)
+    assert "secret" not in str(error.value).replace("secret.bin", "")
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(at=st.floats(0, 1), byte=st.integers(0, 255), length=st.integers(1, 40))
+def test_damaged_bytes_give_a_clip_or_a_clear_error(body, rest, tmp_path, at, byte, length):
+    good = tmp_path / "good.glb"
+    if not good.exists():
+        write_gltf(good, body, rest, procedural_clip("walk", fps=5.0))
+    blob = bytearray(good.read_bytes())
+    # Mostly in the JSON, where meaning is.
+    start = int(at * min(len(blob) - 1, 12_000))
+    blob[start : start + length] = bytes([byte]) * length
+    path = tmp_path / "bad.glb"
+    path.write_bytes(blob)
+    try:
+        read_gltf(path)
+    except MotionError as error:
+        assert "bad.glb" in str(error)
+
+
+def amass(body, rest, motion, layout="poses", z_up=True):
+    """The motion as axis-angle poses of an SMPL-like figure in AMASS's layout."""
+    from physxnet_jax.motion._amass import _FIGURE
+
+    names = {s: b for b, s in JOINT_MAPS["smpl"].items()}
+    world, shift = (np.asarray(x, np.float64) for x in clip_transforms(body, rest, motion))
+    heads = np.asarray(body.joint_positions(rest)[0], np.float64)
+    from physxnet_jax.body import align_global
+
+    # A body whose limbs point as the figure's do at rest.
+    place = {s: np.array(xyz) for s, _, xyz in _FIGURE}
+    targets = {b: place[JOINT_MAPS["smpl"][e]] for b, e in LIMBS.items()}
+    targets = {b: d / np.linalg.norm(d) for b, d in targets.items()}
+    aligned = [r.as_matrix() for r in align_global(body, targets)]
+    turn = Rotation.from_euler("X", 90 if z_up else 0, degrees=True).as_matrix()
+    full = {}
+    for s, _, _ in _FIGURE:
+        j = body.joint_names.index(names[s])
+        full[s] = turn @ world[:, j] @ aligned[j].T
+    poses = []
+    for s, parent, _ in _FIGURE:
+        local = full[s] if parent is None else np.swapaxes(full[parent], 1, 2) @ full[s]
+        poses.append(Rotation.from_matrix(local).as_rotvec())
+    hips = np.einsum("fab,b->fa", world[:, 0], heads[0]) + shift[:, 0]
+    flat = np.concatenate(poses, axis=1)
+    out = {"trans": hips @ turn.T, "mocap_framerate": np.array(motion.fps)}
+    if layout == "poses":
+        hands = np.zeros((len(flat), 90))
+        return out | {"poses": np.concatenate([flat, hands], axis=1), "betas": np.zeros(16)}
+    out["mocap_frame_rate"] = out.pop("mocap_framerate")
+    return out | {"root_orient": flat[:, :3], "pose_body": flat[:, 3:]}
+
+
+@pytest.mark.parametrize("layout", ["poses", "pose_body"])
+@pytest.mark.parametrize("z_up", [True, False])
+def test_a_walk_in_amass_layout_is_the_same_walk(body, rest, tmp_path, layout, z_up):
+    walk = procedural_clip("walk", fps=15.0)
+    path = tmp_path / "walk_poses.npz"
+    np.savez(path, **amass(body, rest, walk, layout, z_up))
+    again = load_motion(path)
+    assert again.num_frames == walk.num_frames and again.fps == 15.0
+    assert limbs_apart(body, rest, walk, again) < 0.2
+    # The size of the figure is a guess: paths agree in direction and nearly in length.
+    ours, theirs = (np.ptp(np.asarray(m.root)[:, 2]) for m in (walk, again))
+    assert theirs == pytest.approx(ours, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"poses": np.zeros((4, 30))}, "poses"),
+        ({"poses": np.zeros((3, 156))}, "trans"),
+        ({"poses": np.zeros((0, 156)), "trans": np.zeros((0, 3))}, "no frame"),
+        ({"poses": np.full((4, 156), np.nan)}, "not finite"),
+        ({"mocap_framerate": np.array(-1.0)}, "mocap_framerate"),
+        ({"mocap_framerate": np.array(["x"])}, "mocap_framerate"),
+        ({"poses": np.full((4, 156), "a")}, "poses are"),
+        ({"poses": np.full((4, 156), None)}, "objects"),
+    ],
+)
+def test_broken_amass_files_are_refused(tmp_path, change, says):
+    good = {"poses": np.zeros((4, 156)), "trans": np.zeros((4, 3)), "mocap_framerate": 30.0}
+    path = tmp_path / "clip.npz"
+    np.savez(path, **(good | change), allow_pickle=True)
+    with pytest.raises(MotionError, match=says):
+        load_motion(path)
+    np.savez(path, **good)
+    assert load_motion(path).num_frames == 4

@@ -1,0 +1,185 @@
+"""Skeletons of other makers: a known motion told in their names and axes comes back."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from physxnet_jax.errors import MotionError
+from physxnet_jax.motion import (
+    JOINT_MAPS,
+    LIMBS,
+    clip_transforms,
+    find_joint_map,
+    load_motion,
+    procedural_clip,
+    read_bvh,
+    read_joint_map,
+)
+
+X_ALONG_BONE = "lafan"
+
+
+def bvh(body, rest, motion, names, frames=None, turn=None, prefix="", moving=False):
+    """The motion as a BVH of the given joint names.
+
+    Args:
+        frames: Body joint to the fixed rotation of its local axes; none by default.
+        turn: Rotation of the whole world (Z up, say).
+        moving: Every joint has six channels, with its offset in them.
+    """
+    world, shift = (np.asarray(x, np.float64) for x in clip_transforms(body, rest, motion))
+    heads = np.asarray(body.joint_positions(rest)[0], np.float64)
+    at = np.einsum("fjab,jb->fja", world, heads) + shift
+    turn = np.eye(3) if turn is None else turn
+    inside = {} if frames is None else frames
+    axes = {b: inside.get(b, np.eye(3)) for b in names}
+    chosen = [b for b in body.joint_names if b in names]
+    parent = {}
+    for b in chosen:
+        j = body.parents[body.joint_names.index(b)]
+        while j >= 0 and body.joint_names[j] not in names:
+            j = body.parents[j]
+        parent[b] = body.joint_names[j] if j >= 0 else None
+    index = body.joint_names.index
+    turned = {b: turn @ world[:, index(b)] @ turn.T @ axes[b] for b in chosen}
+    lines, columns = ["HIERARCHY"], []
+
+    def put(b, depth):
+        mother = parent[b]
+        offset = np.zeros(3)
+        if mother is not None:
+            offset = axes[mother].T @ turn @ (heads[index(b)] - heads[index(mother)])
+        pad = "  " * depth
+        six = mother is None or moving
+        lines.append(f"{pad}{'ROOT' if mother is None else 'JOINT'} {prefix}{names[b]}")
+        lines.append(pad + "{")
+        lines.append(f"{pad}  OFFSET {' '.join(f'{100 * x:.6f}' for x in offset)}")
+        place = "Xposition Yposition Zposition "
+        lines.append(
+            f"{pad}  CHANNELS {6 if six else 3} {place if six else ''}Zrotation Yrotation Xrotation"
+        )
+        local = turned[b] if mother is None else np.swapaxes(turned[mother], 1, 2) @ turned[b]
+        if six:
+            columns.append(
+                100 * (at[:, 0] @ turn.T if mother is None else np.tile(offset, (len(at), 1)))
+            )
+        columns.append(Rotation.from_matrix(local).as_euler("ZYX", degrees=True))
+        children = [c for c in chosen if parent[c] == b]
+        for c in children:
+            put(c, depth + 1)
+        if not children:
+            lines.extend([pad + "  End Site", pad + "  {", pad + "    OFFSET 0 0 0", pad + "  }"])
+        lines.append(pad + "}")
+
+    put("Hips", 0)
+    lines += ["MOTION", f"Frames: {len(at)}", f"Frame Time: {1 / motion.fps:.8f}"]
+    rows = np.concatenate(columns, axis=1)
+    lines += [" ".join(f"{x:.6f}" for x in row) for row in rows]
+    return "\n".join(lines) + "\n"
+
+
+def along_bones(body, rest):
+    """Local axes with X along every bone, as in LAFAN1; the zero pose is a bundle."""
+    heads = np.asarray(body.joint_positions(rest)[0], np.float64)
+    tails = np.asarray(body.joint_positions(rest)[1], np.float64)
+    out = {}
+    for name, head, tail in zip(body.joint_names, heads, tails, strict=True):
+        x = (tail - head) / np.linalg.norm(tail - head)
+        z = np.cross(x, [0.0, 0.0, 1.0])
+        z /= np.linalg.norm(z)
+        out[name] = np.stack([x, np.cross(z, x), z], axis=1)
+    return out
+
+
+def degrees(body, rest, a, b):
+    """Largest angle between limbs, and between joint rotations, of two clips."""
+    at = []
+    for motion in (a, b):
+        world, shift = (np.asarray(x) for x in clip_transforms(body, rest, motion))
+        heads = np.asarray(body.joint_positions(rest)[0])
+        at.append((world, np.einsum("fjab,jb->fja", world, heads) + shift))
+    limbs = 0.0
+    for p, q in LIMBS.items():
+        d, e = (x[1][:, body.joint(q)] - x[1][:, body.joint(p)] for x in at)
+        cosine = (d * e).sum(1) / np.linalg.norm(d, axis=1) / np.linalg.norm(e, axis=1)
+        limbs = max(limbs, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max()))
+    thick = [body.joint(n) for n in (*LIMBS, "Hips")]
+    relative = np.swapaxes(at[0][0][:, thick], 2, 3) @ at[1][0][:, thick]
+    trace = np.trace(relative, axis1=2, axis2=3)
+    turns = np.degrees(np.arccos(np.clip(0.5 * (trace - 1), -1, 1)))
+    return limbs, float(turns.max())
+
+
+@pytest.mark.parametrize("family", ["mixamo", "rokoko", "lafan", "smpl", "cmu-motionbuilder"])
+def test_a_walk_in_the_names_of_others_is_the_same_walk(body, rest, tmp_path, family):
+    walk = procedural_clip("walk", fps=15.0)
+    odd = along_bones(body, rest) if family == X_ALONG_BONE else None
+    path = tmp_path / "a.bvh"
+    prefix = "mixamorig:" if family == "mixamo" else ""
+    path.write_text(bvh(body, rest, walk, JOINT_MAPS[family], odd, prefix=prefix))
+    assert find_joint_map(read_bvh(path))[0] == family
+    again = load_motion(path)
+    assert again.num_frames == walk.num_frames
+    limbs, turns = degrees(body, rest, walk, again)
+    # From a standing frame the turn of a limb about itself is known less well.
+    assert limbs < 0.1 and turns < (5.0 if odd else 1.0)
+    np.testing.assert_allclose(again.root, walk.root, atol=0.01)
+
+
+def test_a_skeleton_that_stands_along_z_is_turned_upright(body, rest, tmp_path):
+    walk = procedural_clip("walk", fps=15.0)
+    z_up = Rotation.from_euler("X", 90, degrees=True).as_matrix()
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(body, rest, walk, JOINT_MAPS["mixamo"], turn=z_up))
+    limbs, turns = degrees(body, rest, walk, load_motion(path))
+    assert limbs < 0.1 and turns < 3.0
+    # Without the turn he would lie on his back.
+    lying = read_bvh(path).positions()
+    assert np.ptp(lying[0][:, 2]) > 2 * np.ptp(lying[0][:, 1])
+
+
+def test_joints_that_move_in_their_parents_are_followed(body, rest, tmp_path):
+    walk = procedural_clip("walk", fps=15.0)
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(body, rest, walk, JOINT_MAPS["mixamo"], moving=True))
+    limbs, turns = degrees(body, rest, walk, load_motion(path))
+    assert limbs < 0.1 and turns < 3.0
+
+
+def test_prefixes_and_missing_toes_and_spines_are_bridged(body, rest, tmp_path):
+    walk = procedural_clip("walk", fps=10.0)
+    few = {b: s for b, s in JOINT_MAPS["mixamo"].items() if "Toe" not in b and b != "Spine1"}
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(body, rest, walk, few, prefix="Model_"))
+    family, joints = find_joint_map(read_bvh(path))
+    assert family == "mixamo" and joints["Hips"] == "Model_Hips" and "LeftToeBase" not in joints
+    limbs, _ = degrees(body, rest, walk, load_motion(path))
+    assert limbs < 0.1
+
+
+def test_a_joint_map_of_ones_own_is_read_from_a_file(body, rest, tmp_path):
+    walk = procedural_clip("walk", fps=10.0)
+    strange = {b: f"bone{n}" for n, b in enumerate(JOINT_MAPS["mixamo"])}
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(body, rest, walk, strange))
+    with pytest.raises(MotionError, match=r"unknown joints.*--joint-map.*bone3"):
+        load_motion(path)
+    names = tmp_path / "names.toml"
+    names.write_text("".join(f'{b} = "{s}"\n' for b, s in strange.items()))
+    limbs, _ = degrees(body, rest, walk, load_motion(path, joint_map=read_joint_map(names)))
+    assert limbs < 0.1
+
+
+@pytest.mark.parametrize("text", ["", "Hips = 3\n", 'Hip = "a"\n', "not toml", '[Hips]\na = "b"\n'])
+def test_broken_joint_maps_are_refused(tmp_path, text):
+    path = tmp_path / "names.toml"
+    path.write_text(text)
+    with pytest.raises(MotionError, match=r"names\.toml.*[Ww]rite"):
+        read_joint_map(path)
+
+
+def test_a_joint_map_that_isnt_text_is_refused(tmp_path):
+    path = tmp_path / "names.toml"
+    path.write_bytes(b"\xff\xfe\x00broken")
+    with pytest.raises(MotionError, match="joint map"):
+        read_joint_map(path)

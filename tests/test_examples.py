@@ -1,0 +1,75 @@
+"""Examples, the notebook and the documents' code run as they stand."""
+
+import json
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import jax
+import pytest
+
+ROOT = pathlib.Path(__file__).parents[1]
+EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+PAGES = [p for p in sorted(ROOT.glob("docs/*.md")) if "```python" in p.read_text()]
+
+
+def test_they_are_numbered_without_a_gap():
+    assert [p.name[:2] for p in EXAMPLES] == [f"{k:02d}" for k in range(5)]
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
+def test_an_example_runs(path, tmp_path):
+    """As a user runs it: a process of its own, in a folder of its own."""
+    # Only not compiled anew what other tests have compiled.
+    environment = os.environ | {
+        "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
+    }
+    done = subprocess.run(
+        [sys.executable, str(path)],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert f"python examples/{path.name}" in path.read_text()
+    if path.name.startswith("04"):
+        found = float(re.search(r"found ([\d.]+) rad", done.stdout).group(1))
+        assert found == pytest.approx(0.6, abs=0.02)
+
+
+def test_the_notebook_runs_and_holds_no_output(capsys):
+    told = json.loads((ROOT / "examples/differentiable_layer.ipynb").read_text())
+    assert told["nbformat"] == 4 and len({c["id"] for c in told["cells"]}) == len(told["cells"])
+    there = {}
+    for cell in told["cells"]:
+        if cell["cell_type"] == "code":
+            assert cell["outputs"] == [] and cell["execution_count"] is None
+            exec("".join(cell["source"]), there)
+    assert there["by_gradient"] == pytest.approx(there["by_difference"], rel=0.05, abs=0.005)
+    assert "True\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda p: p.stem)
+def test_the_code_of_a_page_runs(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    there = {}
+    for code in re.findall(r"```python\n(.*?)```", path.read_text(), re.S):
+        exec(code, there)
+
+
+def test_the_pages_build(tmp_path):
+    """Sphinx makes them without a warning: every reference is found, every page listed."""
+    pytest.importorskip("sphinx_book_theme")
+    words = ["-m", "sphinx", "-W", "-q", "-b", "html", str(ROOT / "docs"), str(tmp_path)]
+    done = subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stderr[-3000:]
+    index = (tmp_path / "index.html").read_text()
+    for page in ROOT.glob("docs/*.md"):
+        assert page.stem == "index" or f"{page.stem}.html" in index, page.name
+    api = re.sub(r"<[^>]*>", "", (tmp_path / "api.html").read_text())
+    assert "physxnet_jax.clothe(" in api and "frames joints 4" in api

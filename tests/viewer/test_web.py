@@ -1,0 +1,197 @@
+"""The web viewer: what is chosen is what is computed, and a browser shows it."""
+
+import io
+import pathlib
+import runpy
+import threading
+import time
+import zipfile
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from physxnet_jax.cli import main, parse
+from physxnet_jax.cli._view import view
+from physxnet_jax.errors import FormatError, PhysXNetError
+from physxnet_jax.io import read_obj
+
+pytest.importorskip("viser")
+
+from physxnet_jax.viewer import Choice, Viewer, carry_out, record
+
+_BROWSER = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "browser.py"))
+SHORT = Choice("walk", ("bottom",), method="lbs", frames=10, fps=10.0)
+
+
+@pytest.fixture(scope="module")
+def viewer():
+    it = Viewer(SHORT, port=8123)
+    it.wait()
+    yield it
+    it.close()
+
+
+def test_what_is_chosen_is_what_is_shown(viewer):
+    assert viewer.shown.choice == SHORT and viewer.shown.num_frames == 10
+    viewer._widgets["motion"].value = "balance"
+    viewer._worn["top"].value = True
+    viewer._shapes["weight_up"].value = 0.5
+    shown = viewer.wait()
+    assert shown.choice.motion == "balance" and shown.choice.wear == ("top", "bottom")
+    assert shown.choice.shape == (("weight_up", 0.5),)
+    assert [m.name for m in shown.garments] == ["top", "bottom"]
+    slim = carry_out(Choice("balance", ("bottom",), method="lbs", frames=2, fps=10.0))
+    assert np.ptp(shown.garments[1].positions[0][:, 0]) > np.ptp(
+        slim.garments[0].positions[0][:, 0]
+    )
+    viewer._shapes["weight_up"].value = 0.0
+    viewer._worn["top"].value = False
+    viewer._widgets["motion"].value = "walk"
+    assert viewer.wait().choice == SHORT
+
+
+def test_a_clip_without_clothes_is_a_body(viewer):
+    viewer._worn["bottom"].value = False
+    assert viewer.wait().garments == ()
+    viewer._worn["bottom"].value = True
+    assert len(viewer.wait().garments) == 1
+
+
+def test_an_error_is_told_and_passes(viewer, tmp_path):
+    viewer.add_file("../../broken.bvh", b"HELLO")
+    with pytest.raises(PhysXNetError, match="HIERARCHY"):
+        viewer.wait()
+    assert "HIERARCHY" in viewer._status.content and ".." not in str(viewer._files["broken.bvh"])
+    viewer._widgets["motion"].value = "walk"
+    assert viewer.wait().choice == SHORT
+    with pytest.raises(FormatError, match="not a motion"):
+        viewer.add_file("a.exe", b"MZ")
+
+
+def test_what_is_taken_away_is_what_is_shown(viewer, tmp_path):
+    shown = viewer.wait()
+    name, content = viewer.export(".npz")
+    assert name == "walk.npz"
+    with np.load(io.BytesIO(content)) as data:
+        np.testing.assert_array_equal(data["bottom_positions"], shown.garments[0].positions)
+        assert data["body_positions"].shape == (10, 13380, 3)
+    name, content = viewer.export(".pc2")
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        assert name == "walk.zip" and len(archive.namelist()) == 4
+        (obj,) = (n for n in archive.namelist() if n.endswith("bottom.obj"))
+        (tmp_path / "bottom.obj").write_bytes(archive.read(obj))
+    viewer.add_file("mine.obj", (tmp_path / "bottom.obj").read_bytes())
+    assert len(read_obj(tmp_path / "bottom.obj").vertices) == 2726
+    assert [m.name for m in viewer.wait().garments] == ["bottom", "mine"]
+    viewer._worn["mine.obj"].value = False
+    viewer.wait()
+
+
+def test_the_skinned_body_on_the_page_is_the_body(viewer, body):
+    """Bones sent to the page move vertices as skinning does, but for the weights beyond four."""
+    shown = viewer.wait()
+    vertices = shown.meshes()[0].positions[5]
+    weights = np.asarray(body.weights[: len(vertices)])
+    x = np.asarray(shown.rest[: len(vertices)])
+    order = np.argsort(-weights, axis=1)[:, :4]
+    four = np.take_along_axis(weights, order, axis=1)
+    four /= four.sum(axis=1, keepdims=True)
+    moved = np.einsum("jab,vb->vja", shown.world[5], x) + shown.shift[5]
+    seen = (np.take_along_axis(moved, order[:, :, None], axis=1) * four[:, :, None]).sum(axis=1)
+    assert np.linalg.norm(seen - vertices, axis=1).max() < 0.01
+
+
+def test_beside_the_simulation_distances_are_told():
+    shown = carry_out(Choice("balance", ("bottom",), method="lbs", frames=3, compare=True))
+    d = shown.distances["bottom"]
+    gap = shown.garments[0].positions - shown.reference[0].positions
+    np.testing.assert_allclose(d, np.linalg.norm(gap, axis=2))
+    assert 0 < d.mean() < 0.05 and "mm RMSE from the simulation" in shown.told
+
+
+def test_maps_show_the_motion():
+    shown = carry_out(Choice("punch", ("top",), weights="nano", frames=20))
+    maps = shown.maps(10, ("top",))
+    assert {"velocity", "acceleration", "top"} == set(maps)
+    still = carry_out(Choice("balance", (), weights="nano", frames=1)).maps(0, ("top",))
+    grey = [np.abs(m["velocity"].astype(int) - 127).max() for m in (maps, still)]
+    covered = (still["velocity"] != 255).any(axis=2)
+    assert grey[0] > 100 and np.abs(still["velocity"][covered].astype(int) - 127).max() <= 1
+    assert maps["top"].shape == (64, 64, 3)
+
+
+def test_a_page_is_written_whole(tmp_path):
+    path = tmp_path / "walk.html"
+    record(path, SHORT)
+    text = path.read_text(encoding="utf-8")
+    assert "__VISER_EMBED_DATA__" in text and len(text) > 1e6
+    assert [p.name for p in tmp_path.iterdir()] == ["walk.html"]
+
+
+def test_the_command_serves_until_it_is_ended_and_writes_pages(tmp_path, capsys, monkeypatch):
+    path = tmp_path / "walk.html"
+    words = ["view", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "3", "--fps", "10"]
+    assert main([*words, "--html", str(path)]) == 0
+    assert "wrote" in capsys.readouterr().out and path.stat().st_size > 1e6
+    assert main([*words, "--html", str(tmp_path / "walk.txt")]) == 2
+    over = threading.Event()
+    over.set()
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+    monkeypatch.delenv("SSH_CONNECTION", raising=False)
+    console = Console(file=io.StringIO(), width=200)
+    assert view(parse([*words, "--port", "8300"]), console, over=over) == 0
+    assert opened == ["http://127.0.0.1:8300"]
+    assert opened[0] in console.file.getvalue()
+    monkeypatch.setenv("SSH_CONNECTION", "here")
+    assert view(parse([*words, "--port", "8300"]), console, over=over) == 0
+    assert len(opened) == 1 and "ssh -L 8300:localhost:8300" in console.file.getvalue()
+
+
+@pytest.fixture
+def page(viewer, tmp_path):
+    it = _BROWSER["Page"](viewer.url, tmp_path / "profile")
+    yield it
+    it.close()
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(_BROWSER["BROWSER"] is None, reason="no Chromium installed")
+def test_a_garment_ticked_in_a_browser_appears(viewer, page, tmp_path):
+    viewer.wait()
+    viewer._playing.value = False
+    page.until("document.body.innerText.includes('bottom')")
+    page.until("document.querySelector('canvas') !== null")
+
+    def picture(enough):
+        end = time.monotonic() + 90
+        while True:
+            time.sleep(2)
+            seen = page.picture()[:, :500]
+            if enough(seen) or time.monotonic() > end:
+                return seen
+
+    def changed(one, other):
+        return float((np.abs(one - other).max(axis=2) > 40).mean())
+
+    # Not one colour: a body, trousers and a floor are there.
+    picture(lambda seen: seen.std() > 10)
+    before = picture(lambda seen: changed(seen, page.picture()[:, :500]) < 1e-4)
+    assert before.std() > 10
+    box = (
+        "[...document.querySelectorAll('input[type=checkbox]')].find(b => {let p = b; for (let k ="
+        " 0; k < 6 && p; k++) {p = p.parentElement; if (p && p.innerText.trim() == 'dress') return"
+        " true} return false})"
+    )
+    page.until(f"({box}) !== undefined")
+    page.run(f"({box}).click()")
+    end = time.monotonic() + 60
+    while "dress" not in viewer.chosen().wear and time.monotonic() < end:
+        time.sleep(0.2)
+    shown = viewer.wait()
+    assert [m.name for m in shown.garments] == ["bottom", "dress"]
+    after = picture(lambda seen: changed(seen, before) > 3e-3)
+    assert changed(after, before) > 3e-3, "the picture of the person has changed"
+    viewer._worn["dress"].value = False
+    viewer.wait()
