@@ -56,6 +56,9 @@ def read_arrays(
     """
     out: dict[str, np.ndarray] = {}
     total = 0
+    # From here on an error of the system means an archive that points nowhere.
+    with pathlib.Path(path).open("rb"):
+        pass
     try:
         with zipfile.ZipFile(path) as archive:
             held = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
@@ -70,7 +73,9 @@ def read_arrays(
                     _check_header(member, name, info.file_size)
                 with archive.open(info) as member:
                     out[name] = np.lib.format.read_array(member, allow_pickle=False)
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+    except ValueError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError) as error:
         raise ValueError(f"not an archive of arrays ({error})") from error
     return out
 

@@ -5,7 +5,6 @@ import json
 import pathlib
 import time
 
-import imageio.v3 as iio
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -103,6 +102,8 @@ def _check(command: Dataset, console: Console) -> int:
         with whole_file(command.json) as part:
             part.write_text(json.dumps(rows, indent=1) + "\n")
     if command.sheet is not None:
+        import imageio.v3 as iio
+
         with whole_file(command.sheet) as part:
             iio.imwrite(part, contact_sheet(pictures), extension=".png")
         console.print(f"wrote {command.sheet}", highlight=False)

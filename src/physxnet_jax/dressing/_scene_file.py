@@ -17,17 +17,17 @@ from ..simulation import ACCURACY, EFFECTS, Effect, Scene, standard_effects
 from ._blocks import inside_out
 from ._meshes import with_names
 
-_KEYS = (
-    "motion",
-    "joint_map",
-    "fps",
-    "frames",
-    "accuracy",
-    "garments",
-    "shape",
-    "effects",
-    "also",
-)
+_KEYS: dict[str, type | tuple[type, ...]] = {
+    "motion": str,
+    "joint_map": str,
+    "fps": (int, float),
+    "frames": int,
+    "accuracy": str,
+    "garments": list,
+    "shape": dict,
+    "effects": dict,
+    "also": dict,
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,13 +130,23 @@ def load_scene(path: str | pathlib.Path) -> SceneFile:
     if unknown or "motion" not in text:
         wrong = f"unknown key {unknown[0]}" if unknown else "no key motion"
         raise FormatError(f"{path}: {wrong}; a scene has {', '.join(_KEYS)}.")
+    for key, value in text.items():
+        if not isinstance(value, _KEYS[key]) or isinstance(value, bool):
+            raise FormatError(f"{path}: {key} can't be {value!r}"[:300] + ".")
+    if not 0 < float(text.get("fps", 30.0)) <= 1e4:
+        raise FormatError(f"{path}: fps is {text['fps']}, expected a positive number.")
     words = [
         {"file": g} if isinstance(g, str) else g for g in text.get("garments", ["top", "bottom"])
     ]
     garments = []
     for g in words:
-        if set(g) - {"file", "fabric"} or "file" not in g:
-            raise FormatError(f"{path}: a garment has file and fabric, not {', '.join(g)}.")
+        told = set(g) if isinstance(g, dict) else {str(g)}
+        if told - {"file", "fabric"} or not all(isinstance(x, str) for x in g.values()):
+            raise FormatError(
+                f"{path}: a garment has file and fabric, both names, not {', '.join(told)}."
+            )
+        if "file" not in g:
+            raise FormatError(f"{path}: a garment has no file.")
         garment = load_garment(_beside(path, g["file"]), body=load_body())[0]
         if "fabric" in g:
             if g["fabric"] not in FABRICS:
@@ -169,12 +179,19 @@ def _effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:
         if name not in EFFECTS:
             raise FormatError(f"{path}: no effect '{name}'; there are {', '.join(EFFECTS)}.")
         kind = EFFECTS[name]
+        if not isinstance(settings, dict):
+            raise FormatError(
+                f"{path}: {name} is a table of settings, not {settings!r}"[:300] + "."
+            )
         fields = {f.name: f for f in dataclasses.fields(kind)}
         unknown = sorted(set(settings) - set(fields))
         if unknown:
             there = ", ".join(fields) or "no settings"
             raise FormatError(f"{path}: {name} has no '{unknown[0]}'; it has {there}.")
-        out.append(kind(**{k: _value(fields[k], v) for k, v in settings.items()}))
+        try:
+            out.append(kind(**{k: _value(fields[k], v) for k, v in settings.items()}))
+        except (TypeError, ValueError) as error:
+            raise FormatError(f"{path}: {name}: {error}"[:300] + ".") from None
     return out
 
 
@@ -182,6 +199,8 @@ def _value(field: dataclasses.Field, value: Any) -> Any:
     if isinstance(value, list):
         return tuple(_value(field, v) for v in value)
     wants_float = field.type is float or "float" in str(field.type)
+    if wants_float and (isinstance(value, bool) or not isinstance(value, int | float)):
+        raise TypeError(f"{field.name} is {value!r}, expected a number")
     return float(value) if isinstance(value, int) and wants_float else value
 
 

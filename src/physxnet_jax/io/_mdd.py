@@ -39,7 +39,7 @@ def read_mdd(
     if len(blob) < _HEADER.size:
         raise FormatError(f"{path}: {len(blob)} bytes are too short for an MDD cache.")
     frames, vertices = _HEADER.unpack_from(blob)
-    if frames < 0 or vertices < 0 or len(blob) != _HEADER.size + 4 * frames * (1 + 3 * vertices):
+    if frames < 1 or vertices < 1 or len(blob) != _HEADER.size + 4 * frames * (1 + 3 * vertices):
         raise FormatError(
             f"{path}: {len(blob)} bytes, but an MDD header would announce {frames} frames of"
             f" {vertices} points. It is truncated, or no MDD."

@@ -119,7 +119,8 @@ def _floats(path: pathlib.Path, n: int, words: list[str], count: int) -> list[fl
         raise FormatError(
             f"{path}:{n}: '{' '.join(words)[:60]}' aren't numbers. Export again."
         ) from None
-    if len(out) != count or not np.isfinite(out).all():
+    # Beyond that their squares aren't finite in float32.
+    if len(out) != count or not (np.abs(out) < 1e18).all():
         raise FormatError(f"{path}:{n}: expected {count} finite numbers, got {out}. Export again.")
     return out
 

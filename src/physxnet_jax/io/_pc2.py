@@ -30,7 +30,7 @@ def read_pc2(path: str | pathlib.Path) -> Float[np.ndarray, "frames vertices 3"]
     if len(blob) < _HEADER.size or not blob.startswith(b"POINTCACHE2\0"):
         raise FormatError(f"{path}: not a PC2 cache.")
     _, _, vertices, _, _, frames = _HEADER.unpack_from(blob)
-    if vertices < 0 or frames < 0 or len(blob) != _HEADER.size + 12 * vertices * frames:
+    if vertices < 1 or frames < 1 or len(blob) != _HEADER.size + 12 * vertices * frames:
         raise FormatError(
             f"{path}: {len(blob)} bytes, but the header announces {frames} frames of"
             f" {vertices} points. It is truncated: write it again."

@@ -108,10 +108,13 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
     folder = _folder(weights)
     try:
         return _load(weights, folder)
-    except (KeyError, TypeError, json.JSONDecodeError, OSError) as error:
+    except WeightsError:
+        raise
+    # A damaged card may hold anything anywhere; safetensors has errors of its own.
+    except Exception as error:
         raise WeightsError(
-            f"{weights}: the card or the tensors are damaged ({error!r}). Reinstall or copy"
-            " them again."
+            f"{weights}: the card or the tensors are damaged ({type(error).__name__}:"
+            f" {str(error)[:200]}). Reinstall or copy them again."
         ) from error
 
 
@@ -132,6 +135,13 @@ def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
         )
     tensors = load_tensors(blob)
     model = _model(card["model"])
+    inputs = model.inputs
+    sizes = (model.resolution, model.width, inputs.frames, inputs.stride)
+    if not all(type(n) is int and 0 < n <= 1024 for n in sizes):
+        raise WeightsError(
+            f"{weights}: the card speaks of {model.resolution} texels a side, width"
+            f" {model.width}, {inputs.frames} frames. Copy it again."
+        )
     atlas = make_atlas(model.resolution)
     if atlas.digest() != card["atlas"]:
         raise WeightsError(

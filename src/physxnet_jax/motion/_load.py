@@ -124,7 +124,7 @@ def _not_motion(path: pathlib.Path, problem: str) -> MotionError:
     return MotionError.at(
         path,
         None,
-        f"not a motion archive ({problem})",
+        f"not a motion archive ({problem[:200]})",
         "It needs arrays rotations [frames, joints, 4], root [frames, 3] and fps, or poses,"
         " trans and mocap_framerate as AMASS has them",
     )

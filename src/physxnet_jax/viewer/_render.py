@@ -1,5 +1,6 @@
 """Still pictures and videos of dressed people, off screen."""
 
+import importlib.util
 import os
 import pathlib
 import warnings
@@ -187,12 +188,15 @@ def render_columns(
 
 
 def check_preview(path: str | pathlib.Path) -> pathlib.Path:
-    """The path, if its extension is one that can be rendered.
+    """The path, if its extension is one that can be rendered and there is what renders it.
 
     Raises:
-        FormatError: Otherwise.
+        FormatError: Another extension.
+        MissingDependencyError: Without the ``render`` extra.
     """
     path = pathlib.Path(path)
     if path.suffix.lower() not in PREVIEWS:
         raise FormatError(f"{path}: a preview is one of {', '.join(PREVIEWS)}.")
+    if any(importlib.util.find_spec(name) is None for name in ("pyvista", "imageio")):
+        raise MissingDependencyError("Pictures need pyvista: pip install 'physxnet-jax[render]'.")
     return path

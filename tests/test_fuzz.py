@@ -1,0 +1,286 @@
+"""Readers of files from anywhere: damaged input gives an answer or one clear error.
+
+`python tests/test_fuzz.py SECONDS` goes on longer, with other seeds each time.
+"""
+
+import hashlib
+import json
+import pathlib
+import random
+import shutil
+import sys
+import tempfile
+import time
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings, strategies as st
+
+from physxnet_jax.dressing import load_scene
+from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.io import load_predictor, read_mdd, read_obj, read_pc2
+from physxnet_jax.motion import load_motion, read_amc, read_bvh, read_joint_map
+
+BVH = """HIERARCHY
+ROOT Hips
+{
+  OFFSET 0 0 0
+  CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation
+  JOINT Knee
+  {
+    OFFSET 0 -1 0
+    CHANNELS 3 Zrotation Yrotation Xrotation
+    End Site
+    {
+      OFFSET 0 -1 0
+    }
+  }
+}
+MOTION
+Frames: 2
+Frame Time: 0.0083333
+0 1 0 0 0 0 0 0 0
+0 1 0 0 0 90 10 0 0
+"""
+ASF = """:version 1.10
+:units
+  mass 1.0
+  length 0.45
+  angle deg
+:root
+  order TX TY TZ RX RY RZ
+  axis XYZ
+  position 0 0 0
+  orientation 0 0 0
+:bonedata
+  begin
+    id 1
+    name lfemur
+    direction 0 -1 0
+    length 2
+    axis 0 0 20 XYZ
+    dof rx
+  end
+:hierarchy
+  begin
+    root lfemur
+  end
+"""
+AMC = ":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 1 0 0 0 0\nlfemur 10\n"
+OBJ = "o a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 1\nvt 0 0\nvt 1 1\nf 1/1 2/2 3/1\nf 2 4 3\nf -1 -2 -3 -4\n"
+SCENE = (
+    'motion = "balance"\nframes = 2\ngarments = ["bottom"]\n[also.air]\nwind = [0.0, 0.0, 4.0]\n'
+)
+NAMES = 'Hips = "a"\nLeftLeg = "b"\n'
+
+
+def _npz(folder, **arrays):
+    np.savez(folder / "good.npz", **arrays)
+    return (folder / "good.npz").read_bytes()
+
+
+def _clip(folder):
+    rotations = np.zeros((3, 31, 4), np.float32)
+    rotations[..., 0] = 1
+    return _npz(folder, rotations=rotations, root=np.zeros((3, 3), np.float32), fps=30.0)
+
+
+def _pc2(folder):
+    from physxnet_jax.io._pc2 import write_pc2
+
+    write_pc2(folder / "a.pc2", np.zeros((2, 3, 3), np.float32))
+    return (folder / "a.pc2").read_bytes()
+
+
+def _mdd(folder):
+    from physxnet_jax.io import write_mdd
+
+    write_mdd(folder / "a.mdd", np.zeros((2, 3, 3), np.float32), 30.0)
+    return (folder / "a.mdd").read_bytes()
+
+
+def _amc(path):
+    path.with_suffix(".asf").write_text(ASF)
+    return read_amc(path, path.with_suffix(".asf"))
+
+
+def _asf(path):
+    (path.parent / "a.amc").write_text(AMC)
+    return read_amc(path.parent / "a.amc", path)
+
+
+def _card(path):
+    """Weights whose card is damaged; the tensors and their hash are as they were."""
+    source = pathlib.Path(sys.modules["physxnet_jax.io"].__file__).parent / "weights/nano"
+    folder = path.parent / "weights"
+    folder.mkdir(exist_ok=True)
+    shutil.copy(source / "weights.safetensors", folder)
+    (folder / "card.json").write_bytes(path.read_bytes())
+    return load_predictor(folder)
+
+
+def _tensors(path):
+    """Damaged tensors with the hash that belongs to them: only their content is wrong."""
+    source = pathlib.Path(sys.modules["physxnet_jax.io"].__file__).parent / "weights/nano"
+    folder = path.parent / "weights"
+    folder.mkdir(exist_ok=True)
+    blob = path.read_bytes()
+    (folder / "weights.safetensors").write_bytes(blob)
+    card = json.loads((source / "card.json").read_text())
+    card["sha256"] = hashlib.sha256(blob).hexdigest()
+    (folder / "card.json").write_text(json.dumps(card))
+    return load_predictor(folder)
+
+
+def _weights(name):
+    return lambda folder: (
+        pathlib.Path(sys.modules["physxnet_jax.io"].__file__).parent / "weights/nano" / name
+    ).read_bytes()
+
+
+# Name: what a good file holds, its ending, its reader, and how many damages a test tries.
+READERS = {
+    "bvh": (lambda f: BVH.encode(), ".bvh", read_bvh, 150),
+    "amc": (lambda f: AMC.encode(), ".amc", _amc, 100),
+    "asf": (lambda f: ASF.encode(), ".asf", _asf, 150),
+    "motion": (_clip, ".npz", load_motion, 100),
+    "obj": (lambda f: OBJ.encode(), ".obj", read_obj, 150),
+    "pc2": (_pc2, ".pc2", read_pc2, 100),
+    "mdd": (_mdd, ".mdd", read_mdd, 100),
+    "scene": (lambda f: SCENE.encode(), ".toml", load_scene, 40),
+    "joint map": (lambda f: NAMES.encode(), ".toml", read_joint_map, 60),
+    "card": (_weights("card.json"), ".json", _card, 20),
+    "tensors": (_weights("weights.safetensors"), ".safetensors", _tensors, 12),
+}
+NASTY = (
+    b'-1 999999999999 1e999 nan inf 0 \xff\xfe \x00 {{{{ }} \n\n .. ../../x / [ ] " 1e308'
+    b" 4294967295 18446744073709551615 True None"
+).split(b" ")
+
+
+def damaged(blob: bytes, seed: int) -> bytes:
+    """Some bytes changed, cut, doubled, or replaced by what readers stumble over."""
+    die = random.Random(seed)
+    out = bytearray(blob)
+    for _ in range(die.randint(1, 4)):
+        at = die.randrange(len(out) + 1)
+        kind = die.randrange(6)
+        length = die.choice((1, 1, 4, 16, 64))
+        if kind == 0:
+            out[at : at + length] = die.randbytes(length)
+        elif kind == 1:
+            del out[at : at + length]
+        elif kind == 2:
+            out[at:at] = out[at : at + length]
+        elif kind == 3:
+            out[at:at] = die.choice(NASTY)
+        elif kind == 4:
+            end = at
+            while end < len(out) and out[end : end + 1].strip():
+                end += 1
+            out[at:end] = die.choice(NASTY)
+        elif die.random() < 0.3:
+            del out[at:]
+    return bytes(out)
+
+
+def tried(name: str, folder: pathlib.Path, blob: bytes) -> bool:
+    """Whether a reader takes it; what it refuses, it refuses by one short sentence."""
+    _, suffix, reader, _ = READERS[name]
+    path = folder / f"file{suffix}"
+    path.write_bytes(blob)
+    before = {p.name for p in folder.iterdir()}
+    try:
+        reader(path)
+    except PhysXNetError as error:
+        assert len(str(error)) < 1500 and "Traceback" not in str(error)
+        return False
+    finally:
+        new = {p.name for p in folder.iterdir()} - before
+        assert new <= {"file.asf", "a.amc", "weights"}, "a reader has written something"
+    return True
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_damaged_files_are_read_or_refused(name, tmp_path):
+    make, _, _, count = READERS[name]
+    blob = make(tmp_path)
+    assert tried(name, tmp_path, blob), "the file that is damaged below is good"
+
+    @settings(max_examples=count, deadline=None, suppress_health_check=list(HealthCheck))
+    @given(seed=st.integers(0, 2**32))
+    def all_seeds(seed):
+        tried(name, tmp_path, damaged(blob, seed))
+
+    all_seeds()
+
+
+HUGE = {
+    "bvh": BVH.replace("Frames: 2", "Frames: 1000000000").encode(),
+    "obj": OBJ.replace("f 2 4 3", "f 2 4 999999999").encode(),
+    "pc2": b"POINTCACHE2\0" + np.array([1, 10**9], "<i4").tobytes() + b"\0" * 12,
+    "mdd": np.array([10**9, 10**9], ">i4").tobytes() + b"\0" * 64,
+}
+
+
+@pytest.mark.parametrize("name", HUGE)
+def test_a_huge_number_in_a_small_file_takes_no_memory(name, tmp_path):
+    tracemalloc.start()
+    assert not tried(name, tmp_path, HUGE[name])
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+
+
+def test_an_archive_that_announces_more_than_it_holds_takes_no_memory(tmp_path):
+    import io
+    import zipfile
+
+    header = io.BytesIO()
+    told = {"descr": "<f4", "fortran_order": False, "shape": (10**9, 31, 4)}
+    np.lib.format.write_array_header_1_0(header, told)
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
+        file.writestr("rotations.npy", header.getvalue() + b"\0" * 64)
+        file.writestr("root.npy", header.getvalue())
+    tracemalloc.start()
+    with pytest.raises(PhysXNetError, match="announces"):
+        load_motion(tmp_path / "a.npz")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 50e6
+
+
+def test_objects_are_never_unpickled(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (pathlib.Path(tmp_path / "sprung").touch, ())
+
+    trap = np.empty(1, object)
+    trap[0] = Trap()
+    np.savez(tmp_path / "a.npz", rotations=trap, root=trap, fps=trap, allow_pickle=True)
+    with pytest.raises(PhysXNetError, match="objects"):
+        load_motion(tmp_path / "a.npz")
+    assert not (tmp_path / "sprung").exists()
+
+
+def main(seconds: float) -> None:
+    """Tries all readers in turn until the time is over; names the seed that broke one."""
+    end = time.monotonic() + seconds
+    count, start = 0, random.SystemRandom().randrange(2**40)
+    with tempfile.TemporaryDirectory() as folder:
+        root = pathlib.Path(folder)
+        goods = {name: READERS[name][0](root) for name in READERS}
+        while time.monotonic() < end:
+            for name, blob in goods.items():
+                try:
+                    tried(name, root, damaged(blob, start + count))
+                except Exception:
+                    print(f"{name}, seed {start + count}")  # noqa: T201
+                    raise
+            count += 1
+    print(f"{count} damages of each of {len(goods)} formats: read or refused")  # noqa: T201
+
+
+if __name__ == "__main__":
+    main(float(sys.argv[1]))

@@ -1,0 +1,104 @@
+"""The wheel, in an environment that has nothing else."""
+
+import json
+import pathlib
+import subprocess
+import sys
+import zipfile
+
+import pytest
+
+import physxnet_jax
+
+ROOT = pathlib.Path(__file__).parents[1]
+UV = pathlib.Path(sys.executable).parent / "uv"
+# What each extra brings, and what asks for it.
+EXTRAS = {
+    "usd": ("pxr", "from physxnet_jax.io import check_output; check_output('a.usdc')"),
+    "gltf": ("pygltflib", "from physxnet_jax.io import check_output; check_output('a.glb')"),
+    "render": ("pyvista", "from physxnet_jax.viewer import check_preview; check_preview('a.png')"),
+    "viewer": ("viser", "from physxnet_jax.viewer._web import _server; _server('127.0.0.1', 8400)"),
+}
+
+
+def run(*words, **more):
+    done = subprocess.run(
+        [str(w) for w in words], capture_output=True, text=True, timeout=900, **more
+    )
+    assert done.returncode == 0, done.stdout[-1000:] + done.stderr[-3000:]
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    out = tmp_path_factory.mktemp("dist")
+    run(UV, "build", "--quiet", "--wheel", "--out-dir", out, ROOT)
+    (path,) = out.glob("*.whl")
+    return path
+
+
+@pytest.fixture(scope="module")
+def python(wheel, tmp_path_factory):
+    """The interpreter of a fresh environment with the wheel, without any extra."""
+    folder = tmp_path_factory.mktemp("empty") / "env"
+    run(UV, "venv", "--quiet", "--python", sys.executable, folder)
+    path = folder / "bin" / "python"
+    run(UV, "pip", "install", "--quiet", "--python", path, wheel)
+    return path
+
+
+def test_the_wheel_holds_weights_types_and_licence_and_nothing_else(wheel):
+    with zipfile.ZipFile(wheel) as file:
+        names = file.namelist()
+    assert "physxnet_jax/py.typed" in names
+    assert any(n.endswith("weights/local/weights.safetensors") for n in names)
+    assert any(n.endswith("licenses/LICENSE") for n in names)
+    roots = {n.split("/")[0] for n in names}
+    assert roots == {"physxnet_jax", f"physxnet_jax-{physxnet_jax.__version__}.dist-info"}
+    assert wheel.stat().st_size < 30e6
+
+
+def test_the_command_works_where_nothing_else_is_installed(python, tmp_path):
+    words = ["dress", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "2"]
+    out = run(python.parent / "physxnet", *words, "-o", tmp_path / "a.npz", cwd=tmp_path)
+    assert "wrote" in out and (tmp_path / "a.npz").is_file()
+
+
+def test_each_extra_is_asked_for_by_name_and_then_enough(python, wheel):
+    for extra, (module, call) in EXTRAS.items():
+        script = f"import sys\ntry:\n    {call}\nexcept ImportError as e:\n    print('needs', e)"
+        out = run(python, "-c", script)
+        assert f"physxnet-jax[{extra}]" in out, extra
+        run(UV, "pip", "install", "--quiet", "--python", python, f"{wheel}[{extra}]")
+        out = run(python, "-c", script + f"\nprint('{module}' in sys.modules)")
+        assert "needs" not in out, extra
+
+
+def test_importing_loads_nothing_and_names_load_no_optional_library():
+    script = """
+import json, sys
+import physxnet_jax as px
+alone = sorted(sys.modules)
+for name in px.__all__:
+    getattr(px, name)
+print(json.dumps([alone, sorted(sys.modules), dir(px)]))
+"""
+    alone, whole, names = json.loads(run(sys.executable, "-c", script))
+    assert not {"jax", "numpy", "flax", "orbax"} & set(alone)
+    assert "jax" in whole and "physxnet_jax.dressing" in whole
+    optional = {"pxr", "pygltflib", "fast_simplification", "viser", "matplotlib", "pyvista"}
+    # Not flatbuffers: jax itself looks for it.
+    optional |= {"imageio", "PIL", "tensorboardX", "sphinx"}
+    assert not optional & set(whole)
+    assert set(physxnet_jax.__all__) <= set(names)
+
+
+def test_the_table_of_rooms_is_whole():
+    """Each public name is found, and lives where the table says."""
+    told = {name for names in physxnet_jax._ROOMS.values() for name in names}
+    assert told == set(physxnet_jax.__all__) - {"__version__"}
+    for name in told:
+        assert getattr(physxnet_jax, name) is not None
+    assert physxnet_jax.motion.load_motion is physxnet_jax.load_motion
+    with pytest.raises(AttributeError, match="no attribute 'undress'"):
+        physxnet_jax.undress  # noqa: B018
