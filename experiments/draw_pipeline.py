@@ -1,9 +1,9 @@
-"""Draws docs/pipeline.png and docs/demo.png: maps in, maps out, mesh dressed.
+"""Draws docs/pipeline.png, docs/demo.png and docs/walk.gif: maps in, maps out, mesh dressed.
 
 Command: python experiments/draw_pipeline.py
 Cost:    one minute.
 Result:  one frame of the built-in punch: velocity, acceleration, gravity and offset maps
-         beside the dressed body; and six moments of the built-in walk.
+         beside the dressed body; six moments of the built-in walk, and the walk moving.
 """
 
 import pathlib
@@ -48,6 +48,8 @@ def main() -> None:
     iio.imwrite("docs/pipeline.png", np.concatenate([maps, mesh], axis=1))
     walk = dress("walk", ["top", "bottom"], frames=48)
     render_preview("docs/demo.png", walk.meshes, walk.fps, size=(240, 416))
+    walk = dress("walk", ["top", "bottom"], frames=60)
+    render_preview("docs/walk.gif", walk.meshes, walk.fps, size=(240, 320))
 
 
 if __name__ == "__main__":

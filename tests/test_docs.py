@@ -96,6 +96,13 @@ def test_blender_saw_what_is_told():
     assert all(float(x) < 1e-5 for x in re.findall(r"\| (\d\.\de-\d+) \|", measured))
 
 
+def test_broken_files_are_refused_as_is_told():
+    made = runpy.run_path(str(ROOT / "experiments/broken_files.py"))["table"]()
+    assert made == (ROOT / "experiments/results/broken_files.md").read_text()
+    assert made in (ROOT / "docs/broken-files.md").read_text()
+    assert "(read)" not in made and made.count("\n") > 30
+
+
 def test_the_reproduction_shows_what_was_measured():
     """Tables and claims are made of the rows, and the shipped cards say the same."""
     text = (ROOT / "docs/reproduction.md").read_text()

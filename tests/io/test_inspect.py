@@ -138,3 +138,12 @@ def test_a_real_garment_is_inspected(data_dir):
     assert (found.unit, found.up, found.template) == ("dm", "Y", "top")
     assert found.health.components == 1 and len(found.health.openings) == 4
     assert found.outward > 0.9 and found.hit_rate > 0.8
+
+
+def test_a_real_dress_is_ready_once_it_is_fitted(data_dir, tmp_path):
+    """Close to the body and split finely: none of it may end where it has to be lifted again."""
+    done, found = fit_garment(
+        data_dir / "garments" / "F_Dress_01.obj", tmp_path / "dress.obj", edge_length=0.02
+    )
+    assert any("lifted" in line for line in done)
+    assert found.problems == () and found.template == "dress" and found.inside == 0.0

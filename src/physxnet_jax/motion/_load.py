@@ -74,6 +74,8 @@ def load_motion(
         source, clip = (read, None) if isinstance(read, SourceClip) else (None, read)
     elif str(motion) in CLIPS:
         clip = procedural_clip(str(motion), fps=float(fps or 30), body=body, shape=shape)
+    elif suffix == ".fbx":
+        raise MotionError.at(path, None, "FBX isn't read", "Export BVH or glTF, from Blender say")
     else:
         raise MotionError(
             f"{motion}: neither a .bvh, .amc, .glb, .gltf or .npz file nor a built-in clip"

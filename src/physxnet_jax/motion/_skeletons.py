@@ -107,7 +107,8 @@ def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
     family = min(missing, key=lambda f: (len(NEEDED - found.get(f, {}).keys()), len(missing[f])))
     joints = found.get(family, {})
     if NEEDED - joints.keys():
-        lacks = ", ".join(missing[family][:6])
+        needed = [s for b, s in JOINT_MAPS[family].items() if b in NEEDED - joints.keys()]
+        lacks = ", ".join(needed[:6])
         raise MotionError.at(
             source.path,
             None,
