@@ -3,6 +3,7 @@
 `python tests/test_fuzz.py SECONDS` goes on longer, with other seeds each time.
 """
 
+import base64
 import hashlib
 import json
 import pathlib
@@ -86,6 +87,53 @@ def _clip(folder):
     return _npz(folder, rotations=rotations, root=np.zeros((3, 3), np.float32), fps=30.0)
 
 
+def _amass(folder):
+    poses = np.zeros((3, 156), np.float32)
+    return _npz(folder, poses=poses, trans=np.zeros((3, 3), np.float32), mocap_framerate=30.0)
+
+
+def _gltf(folder):
+    """A standing figure of Mixamo's joints whose hips rise, as one text."""
+    places = {
+        "Hips": (None, (0, 1, 0)),
+        **{f"{s}UpLeg": ("Hips", (x, 0, 0)) for s, x in (("Left", 0.1), ("Right", -0.1))},
+        **{f"{s}{b}": (f"{s}{a}", (0, -0.4, 0)) for s in ("Left", "Right")
+           for a, b in (("UpLeg", "Leg"), ("Leg", "Foot"))},
+        **{f"{s}Arm": ("Hips", (x, 0.5, 0)) for s, x in (("Left", 0.2), ("Right", -0.2))},
+        **{f"{s}{b}": (f"{s}{a}", (x, 0, 0)) for s, x in (("Left", 0.25), ("Right", -0.25))
+           for a, b in (("Arm", "ForeArm"), ("ForeArm", "Hand"))},
+    }  # fmt: skip
+    names = list(places)
+    nodes = [
+        {"name": n, "translation": list(places[n][1]),
+         "children": [k for k, m in enumerate(names) if places[m][0] == n]}
+        for n in names
+    ]  # fmt: skip
+    blob = np.array([0, 0.1, 0, 1, 0, 0, 1.1, 0], "<f4").tobytes()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+    document = {
+        "asset": {"version": "2.0"},
+        "nodes": nodes,
+        "skins": [{"joints": list(range(len(names)))}],
+        "buffers": [{"byteLength": len(blob), "uri": uri}],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": 8},
+            {"buffer": 0, "byteOffset": 8, "byteLength": 24},
+        ],
+        "accessors": [
+            {"componentType": 5126, "count": 2, "type": "SCALAR", "bufferView": 0},
+            {"componentType": 5126, "count": 2, "type": "VEC3", "bufferView": 1},
+        ],
+        "animations": [
+            {
+                "channels": [{"sampler": 0, "target": {"node": 0, "path": "translation"}}],
+                "samplers": [{"input": 0, "output": 1}],
+            }
+        ],
+    }
+    return json.dumps(document, indent=1).encode()
+
+
 def _pc2(folder):
     from physxnet_jax.io._pc2 import write_pc2
 
@@ -150,6 +198,8 @@ READERS = {
     "mdd": (_mdd, ".mdd", read_mdd, 100),
     "scene": (lambda f: SCENE.encode(), ".toml", load_scene, 40),
     "joint map": (lambda f: NAMES.encode(), ".toml", read_joint_map, 60),
+    "gltf": (_gltf, ".gltf", load_motion, 150),
+    "amass": (_amass, ".npz", load_motion, 100),
     "card": (_weights("card.json"), ".json", _card, 20),
     "tensors": (_weights("weights.safetensors"), ".safetensors", _tensors, 12),
 }
@@ -231,6 +281,24 @@ def test_a_huge_number_in_a_small_file_takes_no_memory(name, tmp_path):
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 50e6
+
+
+def test_frames_times_joints_are_bounded(tmp_path):
+    """Little text on either side of the product, none of it wrong."""
+    document = json.loads(_gltf(tmp_path))
+    blob = np.array([0, 9e8, 0, 1, 0, 0, 1.1, 0], "<f4").tobytes()
+    document["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(blob).decode()
+    (tmp_path / "long.gltf").write_text(json.dumps(document))
+    joints = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\nCHANNELS 0\n}}\n" for k in range(3000))
+    head = BVH[: BVH.index("JOINT Knee")] + joints + "}\nMOTION\nFrames: 20000\nFrame Time: 0.01\n"
+    (tmp_path / "wide.bvh").write_text(head + "0 1 0 0 0 0\n" * 20000)
+    for name in ("long.gltf", "wide.bvh"):
+        tracemalloc.start()
+        with pytest.raises(PhysXNetError, match=name):
+            load_motion(tmp_path / name)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 50e6
 
 
 def test_an_archive_that_announces_more_than_it_holds_takes_no_memory(tmp_path):

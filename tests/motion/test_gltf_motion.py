@@ -145,6 +145,20 @@ def test_between_keys_linear_tracks_are_turned_evenly(body, rest, tmp_path):
     assert half == pytest.approx(0.5 * whole, rel=0.05)
 
 
+def test_names_of_buffers_may_be_written_as_addresses(body, rest, tmp_path):
+    path = write_gltf(tmp_path / "walk.gltf", body, rest, procedural_clip("walk", fps=10.0))
+    (tmp_path / "walk.bin").rename(tmp_path / "my walk.bin")
+    text = path.read_text()
+    path.write_text(text.replace("walk.bin", "my%20walk.bin"))
+    assert load_motion(path).num_frames > 5
+    (tmp_path / "secret.bin").write_bytes((tmp_path / "my walk.bin").read_bytes())
+    inner = tmp_path / "inner"
+    inner.mkdir()
+    (inner / "walk.gltf").write_text(text.replace("walk.bin", "%2e%2e/secret.bin"))
+    with pytest.raises(MotionError, match="outside its folder"):
+        load_motion(inner / "walk.gltf")
+
+
 BROKEN = {
     "no glTF": lambda d, b: (b"hello", None),
     "empty": lambda d, b: (b"", None),

@@ -1,5 +1,6 @@
 """The web viewer: what is chosen is what is computed, and a browser shows it."""
 
+import dataclasses
 import io
 import pathlib
 import runpy
@@ -7,6 +8,7 @@ import threading
 import time
 import zipfile
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
@@ -15,6 +17,7 @@ from physxnet_jax.cli import main, parse
 from physxnet_jax.cli._view import view
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.io import read_obj
+from physxnet_jax.motion import procedural_clip, save_motion
 
 pytest.importorskip("viser")
 
@@ -67,6 +70,38 @@ def test_an_error_is_told_and_passes(viewer, tmp_path):
     assert viewer.wait().choice == SHORT
     with pytest.raises(FormatError, match="not a motion"):
         viewer.add_file("a.exe", b"MZ")
+
+
+def test_what_a_file_says_is_text_on_the_page(viewer):
+    viewer.add_file("a.bvh", b"<iframe srcdoc='x'>*b*")
+    with pytest.raises(PhysXNetError):
+        viewer.wait()
+    assert "<iframe" not in viewer._status.content and "&lt;iframe" in viewer._status.content
+    assert "\\*b\\*" in viewer._status.content
+    viewer._widgets["motion"].value = "walk"
+    viewer.wait()
+
+
+def test_what_cannot_be_carried_out_is_refused_before_anything_listens():
+    with pytest.raises(PhysXNetError, match="at least one"):
+        Viewer(dataclasses.replace(SHORT, frames=0))
+    with pytest.raises(PhysXNetError, match="No weights"):
+        Viewer(dataclasses.replace(SHORT, method="network", weights="none"))
+
+
+def test_on_another_shape_clothes_and_body_stand_on_one_floor(tmp_path):
+    """The clip is cut before its lowest point: clothes and body are lowered alike."""
+    still = procedural_clip("balance", fps=30.0)
+    root = np.asarray(still.root).copy()
+    root[:4, 1] += 0.2
+    save_motion(tmp_path / "hop.npz", dataclasses.replace(still, root=jnp.asarray(root)))
+    path = str(tmp_path / "hop.npz")
+    choice = Choice(path, ("bottom",), method="lbs", frames=4, shape=(("height_up", 0.8),))
+    shown = carry_out(choice)
+    body, trousers = (m.positions for m in shown.meshes())
+    assert abs(body[..., 1].min()) < 0.01
+    # The hem hangs at the ankles, not a hop above or below them.
+    assert 0.0 < trousers[..., 1].min() - body[..., 1].min() < 0.15
 
 
 def test_what_is_taken_away_is_what_is_shown(viewer, tmp_path):

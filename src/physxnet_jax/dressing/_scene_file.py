@@ -133,6 +133,9 @@ def load_scene(path: str | pathlib.Path) -> SceneFile:
     for key, value in text.items():
         if not isinstance(value, _KEYS[key]) or isinstance(value, bool):
             raise FormatError(f"{path}: {key} can't be {value!r}"[:300] + ".")
+    wrong = [k for k, v in text.get("shape", {}).items() if not isinstance(v, int | float)]
+    if wrong:
+        raise FormatError(f"{path}: shape {wrong[0]} isn't a number.")
     if not 0 < float(text.get("fps", 30.0)) <= 1e4:
         raise FormatError(f"{path}: fps is {text['fps']}, expected a positive number.")
     words = [

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
-from ._source import SourceClip
+from ._source import MAX_JOINT_FRAMES, SourceClip
 from ._text import numbers, read_lines
 
 # CMU's files carry no rate; the database was captured at 120 Hz.
@@ -89,6 +89,13 @@ def read_amc(path: str | pathlib.Path, skeleton: str | pathlib.Path | None = Non
             parents.append(names.index(parent))
             queue.append(child)
     count = len(next(iter(frames.values())))
+    if count * len(names) > MAX_JOINT_FRAMES:
+        raise MotionError.at(
+            path,
+            None,
+            f"{count:,} frames of {len(names):,} bones",
+            "Cut the clip into shorter files",
+        )
     world = np.zeros((count, len(names), 3, 3))
     offsets = np.zeros((len(names), 3))
     for j, name in enumerate(names):

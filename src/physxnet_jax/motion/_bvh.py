@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
-from ._source import SourceClip
+from ._source import MAX_JOINT_FRAMES, SourceClip
 from ._text import numbers, read_lines
 
 _AXES = {"Xrotation": "X", "Yrotation": "Y", "Zrotation": "Z"}
@@ -36,9 +36,17 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
     joints, motion_line = _read_hierarchy(path, lines)
     names, parents, offsets, channels = joints
     values, fps = _read_motion(path, lines, motion_line, sum(map(len, channels)))
+    if len(values) * len(names) > MAX_JOINT_FRAMES:
+        raise MotionError.at(
+            path,
+            None,
+            f"{len(values):,} frames of {len(names):,} joints",
+            "Cut the clip into shorter files",
+        )
     root = np.tile(offsets[0], (len(values), 1))
     world = np.zeros((len(values), len(names), 3, 3))
-    shifts = np.tile(offsets, (len(values), 1, 1))
+    moves = any(c in _SLOTS for chans in channels[1:] for c in chans)
+    shifts = np.tile(offsets, (len(values), 1, 1)) if moves else None
     at = 0
     for j, chans in enumerate(channels):
         block = values[:, at : at + len(chans)]
@@ -51,10 +59,11 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
             else np.broadcast_to(np.eye(3), (len(values), 3, 3))
         )
         for k, c in enumerate(chans):
-            if c in _SLOTS:
-                (root if j == 0 else shifts[:, j])[:, _SLOTS[c]] = block[:, k]
+            if c in _SLOTS and j == 0:
+                root[:, _SLOTS[c]] = block[:, k]
+            elif c in _SLOTS and shifts is not None:
+                shifts[:, j, _SLOTS[c]] = block[:, k]
         world[:, j] = local if parents[j] < 0 else world[:, parents[j]] @ local
-    moves = any(c in _SLOTS for chans in channels[1:] for c in chans)
     return SourceClip(
         tuple(names),
         tuple(parents),
@@ -64,7 +73,7 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
         fps,
         path.stem,
         str(path),
-        shifts=shifts if moves else None,
+        shifts=shifts,
     )
 
 

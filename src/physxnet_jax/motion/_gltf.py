@@ -5,7 +5,7 @@ import pathlib
 import numpy as np
 from jaxtyping import Float
 
-from ..errors import MotionError
+from ..errors import MotionError, PhysXNetError
 from ._gltf_file import GltfFile
 from ._source import SourceClip
 
@@ -29,6 +29,21 @@ def read_gltf(path: str | pathlib.Path) -> SourceClip:
     References:
         Khronos, glTF 2.0, sections 3.7.3 (skins) and 3.11 (animations).
     """
+    try:
+        return _read(pathlib.Path(path))
+    except (PhysXNetError, OSError):
+        raise
+    # The library hands on whatever kinds of values the JSON has.
+    except (TypeError, ValueError, AttributeError, LookupError, OverflowError) as error:
+        raise MotionError.at(
+            path,
+            None,
+            f"damaged glTF ({type(error).__name__}: {error})"[:300],
+            "Export it again",
+        ) from error
+
+
+def _read(path: pathlib.Path) -> SourceClip:
     file = GltfFile(path)
     times, fps = file.frame_times()
     nodes = skeleton_nodes(file)
@@ -45,7 +60,7 @@ def read_gltf(path: str | pathlib.Path) -> SourceClip:
         rotations,
         moving[:, 0, :3, 3],
         fps,
-        pathlib.Path(path).stem,
+        path.stem,
         str(path),
         rest,
         _in_parents(rotations, moving[:, :, :3, 3], parents),

@@ -3,6 +3,7 @@
 import base64
 import binascii
 import pathlib
+import urllib.parse
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import MissingDependencyError, MotionError
 from ._motion import slerp
+from ._source import MAX_JOINT_FRAMES
 
 _MAX_BYTES = 1_000_000_000
 _MAX_NODES = 20_000
@@ -156,7 +158,7 @@ class GltfFile:
         step = min(float(np.median(np.diff(k))) for k in keys)
         rate = min(max(1.0 / max(step, 1e-6), 10.0), 240.0)
         rate = float(round(rate)) if abs(rate - round(rate)) < 0.05 else rate
-        if (end - start) * rate > 1e6:
+        if (end - start) * rate * len(self.parents) > MAX_JOINT_FRAMES:
             raise self.broken(f"an animation of {end - start:.0f} seconds")
         return start + np.arange(int((end - start) * rate + 1e-3) + 1) / rate, rate
 
@@ -202,6 +204,7 @@ class GltfFile:
         return self._buffers[n]
 
     def _beside(self, uri: str) -> bytes:
+        uri = urllib.parse.unquote(uri)
         folder = self.path.parent.resolve()
         file = (folder / uri).resolve()
         if ":" in uri or not file.is_relative_to(folder):

@@ -5,6 +5,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+MAX_JOINT_FRAMES = 5e7
+"""Frames times joints that a clip may have: an hour at 120 fps of a hundred joints."""
+
 
 @dataclasses.dataclass(frozen=True)
 class SourceClip:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import html
 import pathlib
 import time
 from collections.abc import Callable
@@ -12,9 +13,10 @@ import numpy as np
 
 from ..body import load_body
 from ..dressing import animated_meshes, dress, fit_surface, load_ladder, make_scene
-from ..io import DEFAULT, AnimatedMesh, load_predictor
+from ..errors import PhysXNetError
+from ..io import DEFAULT, AnimatedMesh, load_predictor, read_card
 from ..models import Predictor
-from ..motion import Motion, clip_transforms, load_motion
+from ..motion import Motion, clip_transforms, load_motion, stand_on_floor
 from ..simulation import ACCURACY, Air, Effect, SelfContact, prepare_scene, simulate_batch
 from ._maps import frame_maps
 
@@ -110,6 +112,18 @@ class Shown:
         )
 
 
+def check_choice(choice: Choice) -> None:
+    """Refuses what no computation could carry out.
+
+    Raises:
+        PhysXNetError: No frame is asked for, or there are no such weights.
+    """
+    if choice.frames < 1:
+        raise PhysXNetError(f"frames is {choice.frames}; ask for at least one.")
+    if choice.method == "network":
+        read_card(choice.weights)
+
+
 def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
     """Dresses the person as chosen.
 
@@ -120,6 +134,7 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
     Raises:
         PhysXNetError: Anything that can't be read, bound or worn; the text says why.
     """
+    check_choice(choice)
     body = load_body()
     shape = _shape(choice)
     clip = load_motion(
@@ -128,6 +143,10 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
     clip = dataclasses.replace(
         clip, rotations=clip.rotations[: choice.frames], root=clip.root[: choice.frames]
     )
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    if shape is not None:
+        # As `dress` does with what is left of the clip: all stand on one floor.
+        clip = stand_on_floor(body, clip, rest)
     garments: tuple[AnimatedMesh, ...] = ()
     reference: tuple[AnimatedMesh, ...] = ()
     lines = [f"{clip.num_frames} frames at {clip.fps:g} fps"]
@@ -162,8 +181,9 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
         for m in garments:
             distances[m.name] = np.linalg.norm(m.positions - by_name[m.name], axis=2)
             rmse = 1e3 * float(np.sqrt((distances[m.name] ** 2).mean()))
-            lines.append(f"{m.name}: {rmse:.1f} mm RMSE from the simulation beside it")
-    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+            # A garment's name comes from a file's; the page takes HTML.
+            name = html.escape(m.name)
+            lines.append(f"{name}: {rmse:.1f} mm RMSE from the simulation beside it")
     world, shift = clip_transforms(body, rest, clip)
     told = "\n".join(f"* {line}" for line in lines if line)
     return Shown(

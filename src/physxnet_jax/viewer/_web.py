@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import html
 import io
 import logging
 import pathlib
@@ -23,7 +24,7 @@ from ..garment import FABRICS, TEMPLATES
 from ..io import EXTENSIONS, list_weights, write_clip
 from ..motion import CLIPS
 from ..simulation import ACCURACY
-from ._job import Choice, Shown, carry_out
+from ._job import Choice, Shown, carry_out, check_choice
 from ._maps import magnified
 from ._stage import Stage
 
@@ -52,6 +53,7 @@ class Viewer:
     """
 
     def __init__(self, choice: Choice, *, host: str = "127.0.0.1", port: int = 8080) -> None:
+        check_choice(choice)
         self.server = _server(host, port)
         self.shown: Shown | None = None
         self._stage: Stage | None = None
@@ -100,7 +102,7 @@ class Viewer:
             shape=shape,
             accuracy=w["accuracy"].value,
             fabric=None if w["fabric"].value == "as cut" else w["fabric"].value,
-            wind=(float(w["wind_x"].value), 0.0, float(w["wind_z"].value)),
+            wind=(float(w["wind_x"].value), self._first.wind[1], float(w["wind_z"].value)),
             self_contact=w["self_contact"].value,
             frames=int(w["frames"].value),
         )
@@ -143,10 +145,12 @@ class Viewer:
         with whole_file(path) as part:
             part.write_bytes(content)
         if suffix == ".asf":
+            # The AMC that asked for it may be there already.
+            self.ask()
             return
         self._files[name] = path
         if suffix == ".obj":
-            with self._clothes:
+            with self._lock, self._clothes:
                 self._add_garment(name, True)
         else:
             menu = self._widgets["motion"]
@@ -216,10 +220,14 @@ class Viewer:
         with gui.add_folder("Cloth"):
             w["method"] = gui.add_dropdown("method", _METHODS, initial_value=choice.method)
             w["weights"] = gui.add_dropdown(
-                "network", tuple(list_weights()), initial_value=choice.weights
+                "network",
+                tuple(dict.fromkeys((*list_weights(), choice.weights))),
+                initial_value=choice.weights,
             )
             w["push_out"] = gui.add_checkbox("push out of the body", choice.push_out)
             w["compare"] = gui.add_checkbox("simulation beside it", choice.compare)
+        strongest = max(10.0, *map(abs, choice.wind))
+        reach = (-strongest, strongest, 0.5)
         with gui.add_folder("When simulating", expand_by_default=False):
             w["accuracy"] = gui.add_dropdown(
                 "accuracy", tuple(ACCURACY), initial_value=choice.accuracy
@@ -227,8 +235,8 @@ class Viewer:
             w["fabric"] = gui.add_dropdown(
                 "fabric", ("as cut", *FABRICS), initial_value=choice.fabric or "as cut"
             )
-            w["wind_x"] = gui.add_slider("wind from the right, m/s", -10.0, 10.0, 0.5, 0.0)
-            w["wind_z"] = gui.add_slider("wind from behind, m/s", -10.0, 10.0, 0.5, 0.0)
+            w["wind_x"] = gui.add_slider("wind from the right, m/s", *reach, choice.wind[0])
+            w["wind_z"] = gui.add_slider("wind from behind, m/s", *reach, choice.wind[2])
             w["self_contact"] = gui.add_checkbox("self-contact", choice.self_contact)
         self._shapes: dict[str, Any] = {}
         body, told = load_body(), dict(choice.shape)
@@ -279,16 +287,21 @@ class Viewer:
         try:
             yield
         except (PhysXNetError, OSError) as error:
-            self._status.content = f"**{error}**"
+            self._tell(error)
+
+    def _tell(self, error: Exception) -> None:
+        """Shows an error as plain text: it may quote a file, and the page takes HTML."""
+        text = html.escape(str(error))
+        self._status.content = "**" + re.sub(r"([\\`*_{}\[\]()#!|])", r"\\\1", text) + "**"
 
     def _work(self) -> None:
         while True:
             self._news.wait()
-            if self._over.is_set():
-                return
             with self._lock:
                 self._news.clear()
                 choice = self._wanted
+            if self._over.is_set():
+                return
             if choice is None:
                 continue
             failed: PhysXNetError | None = None
@@ -304,7 +317,7 @@ class Viewer:
                 traceback.print_exc()
                 failed = PhysXNetError(f"{type(error).__name__}: {error}")
             if failed is not None:
-                self._status.content = f"**{failed}**"
+                self._tell(failed)
             with self._lock:
                 self._failed = failed
                 if not self._news.is_set():
@@ -319,6 +332,7 @@ class Viewer:
         with self._lock, self.server.atomic():
             if self._stage is not None:
                 self._stage.clear()
+                self._stage = None
             self.shown, self._stage = shown, Stage(self.server.scene, shown)
             self._frame.max = max(shown.num_frames - 1, 1)
             self._show_frame()
@@ -337,8 +351,11 @@ class Viewer:
                 self._draw_maps(self.shown, frame)
 
     def _draw_maps(self, shown: Shown, frame: int) -> None:
-        worn = tuple(t for t in TEMPLATES if t in {n for n, box in self._worn.items() if box.value})
-        for name, picture in shown.maps(frame, worn or TEMPLATES).items():
+        worn = tuple(t for t in TEMPLATES if t in shown.choice.wear)
+        pictures = shown.maps(frame, worn or TEMPLATES)
+        for name in self._pictures.keys() - pictures.keys():
+            self._pictures.pop(name).remove()
+        for name, picture in pictures.items():
             picture = magnified(picture, _MAP_SIZE)
             if name in self._pictures:
                 self._pictures[name].image = picture
@@ -354,8 +371,13 @@ class Viewer:
                 self._over.wait(0.1)
                 due = time.monotonic()
                 continue
-            # Setting the slider shows the frame.
-            self._frame.value = (int(self._frame.value) + 1) % shown.num_frames
+            try:
+                # Setting the slider shows the frame.
+                self._frame.value = (int(self._frame.value) + 1) % shown.num_frames
+            except Exception as error:
+                # One frame that can't be shown doesn't end the clip.
+                self._tell(error)
+                self._playing.value = False
             due = max(due + 1.0 / shown.clip.fps, time.monotonic() - 1.0)
             self._over.wait(max(due - time.monotonic(), 0.0))
 
