@@ -17,7 +17,10 @@ EXTRAS = {
     "usd": ("pxr", "from physxnet_jax.io import check_output; check_output('a.usdc')"),
     "gltf": ("pygltflib", "from physxnet_jax.io import check_output; check_output('a.glb')"),
     "render": ("pyvista", "from physxnet_jax.viewer import check_preview; check_preview('a.png')"),
-    "viewer": ("viser", "from physxnet_jax.viewer._web import _server; _server('127.0.0.1', 8400)"),
+    "viewer": (
+        "viser",
+        "from physxnet_jax.viewer._server import start_server; start_server('127.0.0.1', 8400)",
+    ),
 }
 
 

@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import html
 import io
-import logging
 import pathlib
 import re
 import tempfile
@@ -12,13 +11,14 @@ import threading
 import time
 import traceback
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from ..body import load_body
-from ..errors import FormatError, MissingDependencyError, PhysXNetError
+from ..dressing import METHODS
+from ..errors import FormatError, PhysXNetError
 from ..files import whole_file
 from ..garment import FABRICS, TEMPLATES
 from ..io import EXTENSIONS, list_weights, write_clip
@@ -26,9 +26,9 @@ from ..motion import CLIPS
 from ..simulation import ACCURACY
 from ._job import Choice, Shown, carry_out, check_choice
 from ._maps import magnified
+from ._server import start_server
 from ._stage import Stage
 
-_METHODS = ("network", "lbs", "simulate")
 _MOTIONS = (".bvh", ".amc", ".npz", ".glb", ".gltf")
 _MAP_SIZE = 192
 
@@ -54,7 +54,7 @@ class Viewer:
 
     def __init__(self, choice: Choice, *, host: str = "127.0.0.1", port: int = 8080) -> None:
         check_choice(choice)
-        self.server = _server(host, port)
+        self.server = start_server(host, port)
         self.shown: Shown | None = None
         self._stage: Stage | None = None
         self._lock = threading.RLock()
@@ -218,7 +218,7 @@ class Viewer:
                     self._files[short] = pathlib.Path(name)
                 self._add_garment(short, name in choice.wear)
         with gui.add_folder("Cloth"):
-            w["method"] = gui.add_dropdown("method", _METHODS, initial_value=choice.method)
+            w["method"] = gui.add_dropdown("method", METHODS, initial_value=choice.method)
             w["weights"] = gui.add_dropdown(
                 "network",
                 tuple(dict.fromkeys((*list_weights(), choice.weights))),
@@ -380,58 +380,3 @@ class Viewer:
                 self._playing.value = False
             due = max(due + 1.0 / shown.clip.fps, time.monotonic() - 1.0)
             self._over.wait(max(due - time.monotonic(), 0.0))
-
-
-def record(
-    path: str | pathlib.Path,
-    choice: Choice,
-    progress: Callable[[str, int, int], None] | None = None,
-) -> Shown:
-    """Writes what is chosen as one page that plays by itself.
-
-    Args:
-        path: ``.html``; written whole or not at all.
-        choice: What is shown.
-        progress: Called with a stage, frames done and frames in all.
-
-    Raises:
-        FormatError: The path doesn't end in ``.html``.
-        PhysXNetError: Anything that can't be read, bound or worn.
-        MissingDependencyError: Without the ``viewer`` extra.
-    """
-    if pathlib.Path(path).suffix.lower() != ".html":
-        raise FormatError(f"{path}: the page is written as .html.")
-    shown = carry_out(choice, progress)
-    server = _server("127.0.0.1", 8090)
-    try:
-        stage = Stage(server.scene, shown)
-        tape = server.get_scene_serializer()
-        for frame in range(shown.num_frames):
-            stage.show(frame)
-            tape.insert_sleep(1.0 / shown.clip.fps)
-        text = tape.as_html()
-    finally:
-        with contextlib.redirect_stdout(io.StringIO()):
-            server.stop()
-    with whole_file(path) as part:
-        part.write_text(text, encoding="utf-8")
-    return shown
-
-
-def _server(host: str, port: int) -> Any:
-    try:
-        import viser
-    except ImportError as error:
-        raise MissingDependencyError(
-            "The viewer needs viser: pip install 'physxnet-jax[viewer]'."
-        ) from error
-    # A browser that goes away while connecting is nothing to report.
-    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-    # It prints a banner whatever it is told.
-    with contextlib.redirect_stdout(io.StringIO()):
-        server = viser.ViserServer(host=host, port=port, verbose=False)
-    server.scene.set_up_direction("+y")
-    server.scene.add_grid("/floor", width=12.0, height=12.0, plane="xz", cell_size=0.5)
-    server.initial_camera.position = (1.1, 1.3, 2.7)
-    server.initial_camera.look_at = (0.1, 0.85, 0.0)
-    return server
