@@ -8,6 +8,7 @@ import hashlib
 import json
 import pathlib
 import random
+import runpy
 import shutil
 import sys
 import tempfile
@@ -23,52 +24,8 @@ from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.io import load_predictor, read_mdd, read_obj, read_pc2
 from physxnet_jax.motion import load_motion, read_amc, read_bvh, read_joint_map
 
-BVH = """HIERARCHY
-ROOT Hips
-{
-  OFFSET 0 0 0
-  CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation
-  JOINT Knee
-  {
-    OFFSET 0 -1 0
-    CHANNELS 3 Zrotation Yrotation Xrotation
-    End Site
-    {
-      OFFSET 0 -1 0
-    }
-  }
-}
-MOTION
-Frames: 2
-Frame Time: 0.0083333
-0 1 0 0 0 0 0 0 0
-0 1 0 0 0 90 10 0 0
-"""
-ASF = """:version 1.10
-:units
-  mass 1.0
-  length 0.45
-  angle deg
-:root
-  order TX TY TZ RX RY RZ
-  axis XYZ
-  position 0 0 0
-  orientation 0 0 0
-:bonedata
-  begin
-    id 1
-    name lfemur
-    direction 0 -1 0
-    length 2
-    axis 0 0 20 XYZ
-    dof rx
-  end
-:hierarchy
-  begin
-    root lfemur
-  end
-"""
-AMC = ":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 1 0 0 0 0\nlfemur 10\n"
+_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[0] / "samples.py"))
+BVH, ASF, AMC = (_SAMPLES[name] for name in ("BVH", "ASF", "AMC"))
 OBJ = "o a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 1\nvt 0 0\nvt 1 1\nf 1/1 2/2 3/1\nf 2 4 3\nf -1 -2 -3 -4\n"
 SCENE = (
     'motion = "balance"\nframes = 2\ngarments = ["bottom"]\n[also.air]\nwind = [0.0, 0.0, 4.0]\n'

@@ -1,6 +1,8 @@
 """Real clips of every family, and every way a file can be broken."""
 
 import csv
+import pathlib
+import runpy
 
 import numpy as np
 import pytest
@@ -20,52 +22,8 @@ from physxnet_jax.motion import (
     retarget,
 )
 
-BVH = """HIERARCHY
-ROOT Hips
-{
-  OFFSET 0 0 0
-  CHANNELS 6 Xposition Yposition Zposition Zrotation Yrotation Xrotation
-  JOINT Knee
-  {
-    OFFSET 0 -1 0
-    CHANNELS 3 Zrotation Yrotation Xrotation
-    End Site
-    {
-      OFFSET 0 -1 0
-    }
-  }
-}
-MOTION
-Frames: 2
-Frame Time: 0.0083333
-0 1 0 0 0 0 0 0 0
-0 1 0 0 0 90 10 0 0
-"""
-ASF = """:version 1.10
-:units
-  mass 1.0
-  length 0.45
-  angle deg
-:root
-  order TX TY TZ RX RY RZ
-  axis XYZ
-  position 0 0 0
-  orientation 0 0 0
-:bonedata
-  begin
-    id 1
-    name lfemur
-    direction 0 -1 0
-    length 2
-    axis 0 0 20 XYZ
-    dof rx
-  end
-:hierarchy
-  begin
-    root lfemur
-  end
-"""
-AMC = ":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 1 0 0 0 0\nlfemur 10\n2\nroot 0 1 0 0 0 0\nlfemur 20\n"
+_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
+BVH, ASF, AMC = (_SAMPLES[name] for name in ("BVH", "ASF", "AMC"))
 
 
 def test_all_fifty_clips_load_and_have_the_protocols_frames(data_dir):

@@ -1,6 +1,8 @@
 """Motion from glTF and AMASS files, against the clip they were made from."""
 
 import json
+import pathlib
+import runpy
 
 import numpy as np
 import pygltflib
@@ -17,6 +19,9 @@ from physxnet_jax.motion import (
     procedural_clip,
     read_gltf,
 )
+
+_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
+limbs_apart = _SAMPLES["limbs_apart"]
 
 
 def write_gltf(path, body, rest, motion, mode="LINEAR", scale=0.01):
@@ -105,21 +110,6 @@ def write_gltf(path, body, rest, motion, mode="LINEAR", scale=0.01):
     g.buffers.append(pygltflib.Buffer(byteLength=len(blob), uri=uri))
     g.save(str(path))
     return path
-
-
-def limbs_apart(body, rest, a, b):
-    """Largest angle between limbs of two clips [degrees]."""
-    at = []
-    for motion in (a, b):
-        world, shift = (np.asarray(x) for x in clip_transforms(body, rest, motion))
-        heads = np.asarray(body.joint_positions(rest)[0])
-        at.append(np.einsum("fjab,jb->fja", world, heads) + shift)
-    worst = 0.0
-    for p, q in LIMBS.items():
-        d, e = (x[:, body.joint(q)] - x[:, body.joint(p)] for x in at)
-        cosine = (d * e).sum(1) / np.linalg.norm(d, axis=1) / np.linalg.norm(e, axis=1)
-        worst = max(worst, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max()))
-    return worst
 
 
 @pytest.mark.parametrize("mode", ["LINEAR", "CUBICSPLINE", "STEP"])

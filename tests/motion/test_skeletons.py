@@ -1,5 +1,8 @@
 """Skeletons of other makers: a known motion told in their names and axes comes back."""
 
+import pathlib
+import runpy
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,6 +20,8 @@ from physxnet_jax.motion import (
 )
 
 X_ALONG_BONE = "lafan"
+_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
+limbs_apart = _SAMPLES["limbs_apart"]
 
 
 def bvh(body, rest, motion, names, frames=None, turn=None, prefix="", moving=False):
@@ -93,21 +98,11 @@ def along_bones(body, rest):
 
 def degrees(body, rest, a, b):
     """Largest angle between limbs, and between joint rotations, of two clips."""
-    at = []
-    for motion in (a, b):
-        world, shift = (np.asarray(x) for x in clip_transforms(body, rest, motion))
-        heads = np.asarray(body.joint_positions(rest)[0])
-        at.append((world, np.einsum("fjab,jb->fja", world, heads) + shift))
-    limbs = 0.0
-    for p, q in LIMBS.items():
-        d, e = (x[1][:, body.joint(q)] - x[1][:, body.joint(p)] for x in at)
-        cosine = (d * e).sum(1) / np.linalg.norm(d, axis=1) / np.linalg.norm(e, axis=1)
-        limbs = max(limbs, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max()))
     thick = [body.joint(n) for n in (*LIMBS, "Hips")]
-    relative = np.swapaxes(at[0][0][:, thick], 2, 3) @ at[1][0][:, thick]
-    trace = np.trace(relative, axis1=2, axis2=3)
+    one, other = (np.asarray(clip_transforms(body, rest, m)[0])[:, thick] for m in (a, b))
+    trace = np.trace(np.swapaxes(one, 2, 3) @ other, axis1=2, axis2=3)
     turns = np.degrees(np.arccos(np.clip(0.5 * (trace - 1), -1, 1)))
-    return limbs, float(turns.max())
+    return limbs_apart(body, rest, a, b), float(turns.max())
 
 
 @pytest.mark.parametrize("family", ["mixamo", "rokoko", "lafan", "smpl", "cmu-motionbuilder"])
