@@ -54,6 +54,18 @@ def test_what_is_chosen_is_what_is_shown(viewer):
     assert viewer.wait().choice == SHORT
 
 
+def test_what_is_ticked_is_waited_for_before_anybody_asked(viewer, monkeypatch):
+    """Between a tick and the answer to it lies a moment: what was shown then is stale."""
+    viewer.wait()
+    late = threading.Timer(1.0, Viewer.ask, (viewer,))
+    monkeypatch.setattr(viewer, "ask", late.start)
+    viewer._worn["top"].value = True
+    assert [m.name for m in viewer.wait().garments] == ["top", "bottom"]
+    monkeypatch.undo()
+    viewer._worn["top"].value = False
+    assert viewer.wait().choice == SHORT
+
+
 def test_a_clip_without_clothes_is_a_body(viewer):
     viewer._worn["bottom"].value = False
     assert viewer.wait().garments == ()

@@ -59,6 +59,7 @@ class Viewer:
         self._stage: Stage | None = None
         self._lock = threading.RLock()
         self._wanted: Choice | None = None
+        self._settled: Choice | None = None
         self._news = threading.Event()
         self._over = threading.Event()
         self._folder = tempfile.TemporaryDirectory(prefix="physxnet-view-")
@@ -122,7 +123,9 @@ class Viewer:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             with self._lock:
-                if self._wanted is None and not self._news.is_set():
+                # A box is ticked a moment before anybody has asked for what it means.
+                settled = self._wanted is None and self._settled == self.chosen()
+                if settled and not self._news.is_set():
                     if self._failed is not None:
                         raise self._failed
                     if self.shown is not None:
@@ -319,7 +322,7 @@ class Viewer:
             if failed is not None:
                 self._tell(failed)
             with self._lock:
-                self._failed = failed
+                self._failed, self._settled = failed, choice
                 if not self._news.is_set():
                     self._wanted = None
 
