@@ -21,7 +21,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 
 from physxnet_jax.dressing import load_scene
 from physxnet_jax.errors import PhysXNetError
-from physxnet_jax.io import load_predictor, read_mdd, read_obj, read_pc2
+from physxnet_jax.io import load_predictor, read_character, read_mdd, read_obj, read_pc2
 from physxnet_jax.motion import load_motion, read_amc, read_bvh, read_joint_map
 
 _SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[0] / "samples.py"))
@@ -105,6 +105,57 @@ def _mdd(folder):
     return (folder / "a.mdd").read_bytes()
 
 
+def _character(folder):
+    x = np.array([[0, 0, 0], [1, 0, 0], [0, 1.7, 0]], np.float32)
+    return _npz(folder, positions=np.stack([x, x + 0.1]), faces=np.array([[0, 1, 2]]), fps=30.0)
+
+
+def _usda(folder):
+    return b"""#usda 1.0
+(
+    endTimeCode = 1
+    startTimeCode = 0
+    timeCodesPerSecond = 30
+    upAxis = "Y"
+)
+def Mesh "body"
+{
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    point3f[] points.timeSamples = {
+        0: [(0, 0, 0), (1, 0, 0), (0, 1.7, 0)],
+        1: [(0, 0, 0), (1, 0, 0), (0, 1.8, 0)],
+    }
+}
+"""
+
+
+def _skin(folder):
+    """Two triangles that hang on the figure's hips."""
+    document = json.loads(_gltf(folder))
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1.7, 0], [1, 1, 0]], "<f4")
+    faces = np.array([0, 1, 2, 1, 3, 2], "<u2")
+    share = np.tile(np.array([1, 0, 0, 0], "<f4"), (4, 1))
+    blob = points.tobytes() + faces.tobytes() + np.zeros((4, 4), "u1").tobytes()
+    blob = blob + b"\0" * (-len(blob) % 4) + share.tobytes()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+    n, m, b = (len(document[k]) for k in ("accessors", "bufferViews", "buffers"))
+    document["buffers"].append({"byteLength": len(blob), "uri": uri})
+    starts, sizes = (0, 48, 60, 76), (48, 12, 16, 64)
+    document["bufferViews"] += [
+        {"buffer": b, "byteOffset": s, "byteLength": k} for s, k in zip(starts, sizes)
+    ]
+    kinds = ((5126, 4, "VEC3"), (5123, 6, "SCALAR"), (5121, 4, "VEC4"), (5126, 4, "VEC4"))
+    document["accessors"] += [
+        {"bufferView": m + k, "componentType": c, "count": q, "type": t}
+        for k, (c, q, t) in enumerate(kinds)
+    ]
+    attributes = {"POSITION": n, "JOINTS_0": n + 2, "WEIGHTS_0": n + 3}
+    document["meshes"] = [{"primitives": [{"attributes": attributes, "indices": n + 1}]}]
+    document["nodes"].append({"name": "figure", "mesh": 0, "skin": 0})
+    return json.dumps(document).encode()
+
+
 def _amc(path):
     path.with_suffix(".asf").write_text(ASF)
     return read_amc(path, path.with_suffix(".asf"))
@@ -157,6 +208,9 @@ READERS = {
     "joint map": (lambda f: NAMES.encode(), ".toml", read_joint_map, 60),
     "gltf": (_gltf, ".gltf", load_motion, 150),
     "amass": (_amass, ".npz", load_motion, 100),
+    "character": (_character, ".npz", read_character, 60),
+    "usd": (_usda, ".usda", read_character, 60),
+    "skin": (_skin, ".gltf", read_character, 150),
     "card": (_weights("card.json"), ".json", _card, 20),
     "tensors": (_weights("weights.safetensors"), ".safetensors", _tensors, 12),
 }

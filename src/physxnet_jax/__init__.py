@@ -28,12 +28,14 @@ if _sys.argv[1:2] != ["doctor"]:
 if _TYPE_CHECKING:
     from .body import Body as Body, load_body as load_body
     from .dressing import (
+        Character as Character,
         Clothed as Clothed,
         DressedClip as DressedClip,
         Dresser as Dresser,
         clothe as clothe,
         clothe_frame as clothe_frame,
         dress as dress,
+        load_character as load_character,
         make_dresser as make_dresser,
         start_clothing as start_clothing,
     )
@@ -60,12 +62,14 @@ if _TYPE_CHECKING:
 _ROOMS = {
     "body": ("Body", "load_body"),
     "dressing": (
+        "Character",
         "Clothed",
         "DressedClip",
         "Dresser",
         "clothe",
         "clothe_frame",
         "dress",
+        "load_character",
         "make_dresser",
         "start_clothing",
     ),
@@ -81,6 +85,7 @@ _HOME = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = [
     "Body",
+    "Character",
     "Clothed",
     "DressedClip",
     "Dresser",
@@ -99,6 +104,7 @@ __all__ = [
     "fit_garment",
     "inspect_garment",
     "load_body",
+    "load_character",
     "load_garment",
     "load_motion",
     "load_predictor",

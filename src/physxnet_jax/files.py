@@ -36,7 +36,7 @@ def whole_file(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def read_arrays(
-    path: str | pathlib.Path, names: Sequence[str], *, limit: int = 2_000_000_000
+    path: str | pathlib.Path, names: Sequence[str] | None = None, *, limit: int = 2_000_000_000
 ) -> dict[str, np.ndarray]:
     """Arrays of an `.npz`, by name; those that aren't in it are left out.
 
@@ -45,7 +45,7 @@ def read_arrays(
 
     Args:
         path: The archive.
-        names: Which arrays to read.
+        names: Which arrays to read; all if omitted.
         limit: Largest size of all of them together, unpacked [bytes].
 
     Raises:
@@ -61,7 +61,7 @@ def read_arrays(
     try:
         with zipfile.ZipFile(path) as archive:
             held = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
-            for name in names:
+            for name in held if names is None else names:
                 if name not in held:
                     continue
                 info = held[name]

@@ -17,6 +17,11 @@ from ._kinematics import (
     forward_kinematics as forward_kinematics,
     linear_blend_skinning as linear_blend_skinning,
 )
+from ._register import (
+    Registration as Registration,
+    clothed_vertices as clothed_vertices,
+    register_body as register_body,
+)
 from ._segments import (
     CALVES as CALVES,
     FOREARMS as FOREARMS,

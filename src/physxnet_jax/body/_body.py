@@ -171,6 +171,12 @@ class Body:
             targets |= {f"{side}UpLeg": down, f"{side}Leg": down}
         return jnp.asarray(align_bones(self, targets, shape), jnp.float32)
 
+    def with_rest(self, rest: Float[Array, "all 3"]) -> "Body":
+        """The body with other rest vertices [m], helpers included, whatever its shape."""
+        return dataclasses.replace(
+            self, bases=jnp.stack([rest, rest]), deltas=jnp.zeros_like(self.deltas)
+        )
+
     def joint(self, name: str) -> int:
         """Index of a joint by name."""
         return self.joint_names.index(name)

@@ -16,12 +16,17 @@ class Dress:
       physxnet dress 02_04.amc --wear dress --preview dress.mp4
       physxnet dress dance.bvh --wear my_shirt.obj bottom --method simulate -o out.pc2
       physxnet dress walk --wear dress --budget-ms 5 -o walk.usdc
+      physxnet dress my_dancer.glb --own-body --wear top bottom -o dancer.usdc
     """
 
     motion: tyro.conf.Positional[str]
     """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
     wear: tuple[str, ...] = ("top", "bottom")
     """Templates (top, bottom, dress) and OBJ files."""
+    own_body: bool = False
+    """The file is a person of your own to be dressed: .glb, .usd, .pc2, .mdd (with OBJ), .npz."""
+    body_mesh: str | None = None
+    """Of --own-body: name of the body's mesh, in a file of several."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Result: .usdc, .usd, .usda, .pc2, .mdd (with OBJ), .glb, .html, .obj (one a frame), .npz."""
     preview: pathlib.Path | None = None

@@ -177,7 +177,7 @@ def _experiment(command: Dataset | Train | Evaluate, console: Console) -> int:
 
 def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) -> int:
     from ..body import load_body
-    from ..dressing import dress
+    from ..dressing import dress, load_character
     from ..io import check_output, write_clip
     from ..motion import load_motion
     from ..viewer import check_preview, render_preview
@@ -190,19 +190,35 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     if command.preview is not None:
         check_preview(command.preview)
     shape = load_body().shape(**_parse_shape(command.shape)) if command.shape else None
+    if command.own_body and (shape is not None or command.joint_map is not None):
+        raise PhysXNetError("--own-body brings its shape along: leave out --shape and --joint-map.")
+    if command.body_mesh is not None and not command.own_body:
+        raise PhysXNetError("--body-mesh chooses a mesh for --own-body: add that.")
     if command.quiet:
         console = Console(quiet=True)
     with progress_bars(console) as progress:
-        motion = load_motion(
-            command.motion,
-            fps=command.fps,
-            source_fps=command.source_fps,
-            skeleton=command.skeleton,
-            joint_map=command.joint_map,
-            shape=shape,
-        )
+        if command.own_body:
+            motion = load_character(
+                command.motion,
+                fps=command.fps,
+                source_fps=command.source_fps,
+                mesh=command.body_mesh,
+                frames=command.frames,
+                progress=progress,
+            )
+            frames = motion.motion.num_frames
+        else:
+            motion = load_motion(
+                command.motion,
+                fps=command.fps,
+                source_fps=command.source_fps,
+                skeleton=command.skeleton,
+                joint_map=command.joint_map,
+                shape=shape,
+            )
+            frames = motion.num_frames
         if command.out is not None:
-            check_output(command.out, min(motion.num_frames, command.frames or motion.num_frames))
+            check_output(command.out, min(frames, command.frames or frames))
         ways = {
             "method": command.method,
             "accuracy": command.accuracy,

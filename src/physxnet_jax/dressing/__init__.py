@@ -1,6 +1,11 @@
 """Dressing: the whole way from motion and garments to animated meshes."""
 
 from ._blocks import dress_block as dress_block
+from ._character import (
+    Character as Character,
+    load_character as load_character,
+    make_character as make_character,
+)
 from ._cost import (
     Cost as Cost,
     mean_errors as mean_errors,

@@ -25,6 +25,7 @@ from ..motion import (
 from ..simulation import ACCURACY
 from ..uv import Binding, Transference, bind
 from ._blocks import inside_share, predict_clip, simulate_clip
+from ._character import Character, follow_leftover, inside_character, on_character
 from ._meshes import animated_meshes, with_names
 from ._push_out import make_patch, tuck_in
 from ._stages import Stage, Watch
@@ -73,7 +74,7 @@ class DressedClip:
 
 
 def dress(
-    motion: Motion | str | pathlib.Path,
+    motion: Motion | Character | str | pathlib.Path,
     wear: Sequence[Garment | str | pathlib.Path] = ("top", "bottom"),
     *,
     method: Method = "network",
@@ -90,7 +91,8 @@ def dress(
     """Dresses a moving person.
 
     Args:
-        motion: A motion, a motion file, or the name of a built-in clip.
+        motion: A motion, a motion file, the name of a built-in clip, or a person of one's
+            own (`load_character`), who brings body, shape and frame rate along.
         wear: Garments, OBJ files or template names.
         method: ``network`` (packaged weights), ``lbs`` (skinning alone, the baseline)
             or ``simulate`` (the cloth simulator, the network's teacher).
@@ -121,6 +123,11 @@ def dress(
         raise PhysXNetError(f"No accuracy '{accuracy}'; there are {', '.join(ACCURACY)}.")
     if frames is not None and frames < 1:
         raise PhysXNetError(f"frames is {frames}; ask for at least one.")
+    person = motion if isinstance(motion, Character) else None
+    if person is not None:
+        if body is not None or shape is not None:
+            raise PhysXNetError("A character has a body of its own: leave out body and shape.")
+        motion, body, fps = person.motion, person.body, person.fps
     stages: list[Stage] = []
     watch = Watch(stages)
     body = load_body() if body is None else body
@@ -132,14 +139,19 @@ def dress(
             if shape is not None:
                 clip = stand_on_floor(body, clip, rest)
         else:
+            assert not isinstance(motion, Character)
             clip = load_motion(motion, fps=fps, body=body, shape=shape)
         if frames is not None:
             clip = Motion(clip.rotations[:frames], clip.root[:frames], clip.fps, clip.name)
         world, shift = clip_transforms(body, rest, clip)
     with watch("garments"):
+        # A character's clothes are modelled on the body as it is, and carried over.
+        on = body if person is None else load_body()
         garments = with_names(
-            [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
+            [g if isinstance(g, Garment) else load_garment(g, body=on)[0] for g in wear]
         )
+        if person is not None:
+            garments = [on_character(g, person) for g in garments]
     hits: dict[str, float | None] = {g.name: None for g in garments}
     fallbacks: dict[str, int | None] = {g.name: None for g in garments}
     predictor = None
@@ -170,7 +182,15 @@ def dress(
         for w, p in zip(wearables, patches, strict=True)
     }
     with watch("body"):
+        if person is not None:
+            positions = {g.name: follow_leftover(g, person, positions[g.name]) for g in garments}
+            inside = {g.name: inside_character(person, positions[g.name]) for g in garments}
         meshes = animated_meshes(body, clip, shape, garments, positions, include_body)
+        if person is not None and include_body:
+            whole = dataclasses.replace(
+                person.mesh, positions=person.mesh.positions[: clip.num_frames]
+            )
+            meshes = (whole, *meshes[1:])
     return DressedClip(
         meshes,
         clip.fps,
@@ -180,6 +200,7 @@ def dress(
         inside if inside_raw is None else inside_raw,
         inside,
         method,
+        () if person is None else person.notes,
     )
 
 

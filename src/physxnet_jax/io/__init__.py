@@ -1,6 +1,7 @@
 """Files in and out. Optional libraries are imported inside the functions."""
 
-from ._clip import AnimatedMesh as AnimatedMesh
+from ._character import CHARACTER_FORMATS as CHARACTER_FORMATS, read_character as read_character
+from ._clip import AnimatedMesh as AnimatedMesh, smooth_normals as smooth_normals
 from ._garment import GarmentReport as GarmentReport, load_garment as load_garment
 from ._gltf import write_gltf as write_gltf
 from ._html import write_html as write_html

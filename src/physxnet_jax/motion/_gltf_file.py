@@ -147,17 +147,28 @@ class GltfFile:
             out[:, n] = m if parent < 0 else out[:, parent] @ m
         return out
 
-    def frame_times(self, animation: int = 0) -> tuple[Float[np.ndarray, " frames"], float]:
-        """Times of an animation's frames [s], and their rate: that of its closest keys."""
+    def frame_times(
+        self, animation: int = 0, *, rate: float | None = None
+    ) -> tuple[Float[np.ndarray, " frames"], float]:
+        """Times of an animation's frames [s], and their rate.
+
+        Args:
+            animation: Which one.
+            rate: Frames a second; that of its closest keys if omitted, and then morph
+                targets don't count.
+        """
         keys = [times for times, _, _ in self._tracks(animation).values() if len(times) > 1]
+        if rate is not None:
+            keys += [t for t, _, _ in self._morphs(animation).values() if len(t) > 1]
         if not keys:
             raise MotionError.at(
                 self.path, None, "no animation of nodes", "Export it with its animation"
             )
         start, end = min(float(k[0]) for k in keys), max(float(k[-1]) for k in keys)
-        step = min(float(np.median(np.diff(k))) for k in keys)
-        rate = min(max(1.0 / max(step, 1e-6), 10.0), 240.0)
-        rate = float(round(rate)) if abs(rate - round(rate)) < 0.05 else rate
+        if rate is None:
+            step = min(float(np.median(np.diff(k))) for k in keys)
+            rate = min(max(1.0 / max(step, 1e-6), 10.0), 240.0)
+            rate = float(round(rate)) if abs(rate - round(rate)) < 0.05 else rate
         if (end - start) * rate * len(self.parents) > MAX_JOINT_FRAMES:
             raise self.broken(f"an animation of {end - start:.0f} seconds")
         return start + np.arange(int((end - start) * rate + 1e-3) + 1) / rate, rate
@@ -186,6 +197,42 @@ class GltfFile:
             ):
                 raise self.broken(f"the keys of node {node}, {kind}")
             out[node, kind] = (times, values, mode)
+        return out
+
+    def morph_weights(
+        self, node: int, times: Float[np.ndarray, " frames"], animation: int = 0
+    ) -> Float[np.ndarray, "frames targets"] | None:
+        """Weights of a node's morph targets over time; None where nothing moves them."""
+        track = self._morphs(animation).get(node)
+        if track is None:
+            return None
+        keys, values, mode = track
+        return _at(keys, values, mode, times, "weights")
+
+    def _morphs(self, animation: int) -> dict[int, tuple[np.ndarray, np.ndarray, str]]:
+        document = self.document
+        if not document.animations:
+            return {}
+        a = document.animations[self.index(animation, document.animations, "animation")]
+        out = {}
+        for channel in a.channels:
+            if channel.target.node is None or channel.target.path != "weights":
+                continue
+            node = self.index(channel.target.node, document.nodes, "node")
+            sampler = a.samplers[self.index(channel.sampler, a.samplers, "sampler")]
+            times = np.asarray(self.accessor(sampler.input), float)
+            values = np.asarray(self.accessor(sampler.output), float)
+            mode = sampler.interpolation or "LINEAR"
+            rows = 3 * len(times) if mode == "CUBICSPLINE" else len(times)
+            if (
+                times.ndim != 1
+                or values.ndim != 1
+                or len(values) % rows
+                or not (np.isfinite(times).all() and np.isfinite(values).all())
+                or (np.diff(times) < 0).any()
+            ):
+                raise self.broken(f"the keys of node {node}, weights")
+            out[node] = (times, values.reshape(rows, -1), mode)
         return out
 
     def _buffer(self, which: object) -> bytes:

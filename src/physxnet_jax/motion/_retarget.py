@@ -97,7 +97,7 @@ def retarget(
     for j, parent in enumerate(body.parents):
         if parent >= 0:
             local[:, j] = np.swapaxes(world[:, parent], 1, 2) @ world[:, j]
-    quaternions = _continuous(
+    quaternions = continuous(
         Rotation.from_matrix(local.reshape(-1, 3, 3))
         .as_quat(scalar_first=True)
         .reshape(len(root), -1, 4)
@@ -149,7 +149,7 @@ def _world_rotations(
     return world
 
 
-def _continuous(
+def continuous(
     q: Float[np.ndarray, "frames joints 4"],
 ) -> Float[np.ndarray, "frames joints 4"]:
     """Signs chosen so that successive quaternions are near each other."""

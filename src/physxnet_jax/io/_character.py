@@ -1,0 +1,252 @@
+"""Animated persons of other programs: point caches, USD, npz, glTF."""
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..errors import FormatError
+from ..files import read_arrays
+from ._clip import AnimatedMesh
+from ._mdd import read_mdd
+from ._obj import read_obj
+from ._pc2 import read_pc2
+
+CHARACTER_FORMATS = (".glb", ".gltf", ".usdc", ".usd", ".usda", ".pc2", ".mdd", ".npz")
+"""Endings that `read_character` knows."""
+
+# Coordinates of a clip that are read at most.
+_MOST = 3e8
+# Heights of a person [m], grown or a child, in units that programs write.
+_HEIGHTS = (0.8, 2.6)
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254}
+
+
+@dataclasses.dataclass(frozen=True)
+class Moving:
+    """A part of a file: a mesh that moves, in the file's own unit and axes.
+
+    Attributes:
+        name: Its name there.
+        positions: Shape [frames, vertices, 3].
+        faces: Triangles.
+        uv: Texture coordinates; or None.
+        uv_faces: Corners in ``uv``; or None.
+        bind: The pose in which a skin was bound, shape [vertices, 3]; or None.
+    """
+
+    name: str
+    positions: Float[np.ndarray, "frames vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    uv: Float[np.ndarray, "uvs 2"] | None = None
+    uv_faces: Int[np.ndarray, "faces 3"] | None = None
+    bind: Float[np.ndarray, "vertices 3"] | None = None
+
+
+def read_character(
+    path: str | pathlib.Path,
+    *,
+    fps: float | int = 30.0,
+    source_fps: float | int | None = None,
+    mesh: str | None = None,
+    frames: int | None = None,
+) -> tuple[AnimatedMesh, Float[np.ndarray, "vertices 3"] | None, tuple[str, ...]]:
+    """A person of one's own, animated elsewhere.
+
+    ``.glb``, ``.gltf``: skins with their first animation, or morph targets. ``.usd*``:
+    points as time samples, skins of UsdSkel. ``.pc2``, ``.mdd``: caches, with the OBJ of
+    their faces beside them. ``.npz``: ``positions``, ``faces`` and ``fps``, or with a
+    mesh's name before the first two, as `write_clip` writes. Several meshes become one,
+    but for files in which one is called body: that one is taken.
+
+    Args:
+        path: The file.
+        fps: Frames a second of the result.
+        source_fps: True rate of a file that doesn't say it; else 30.
+        mesh: Name of the mesh to take.
+        frames: Keep only this many frames.
+
+    Returns:
+        The person [m], Y up; the bind pose of a skin, else None; what was found out
+        about unit and axes.
+
+    Raises:
+        FormatError: No such format, a damaged file, no such mesh, nothing as high as a
+            person in any unit.
+        MotionError: A damaged glTF.
+        MissingDependencyError: Without the library that reads it.
+    """
+    path = pathlib.Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in CHARACTER_FORMATS:
+        raise FormatError(
+            f"{path}: no animated person is read from '{suffix}', only from"
+            f" {', '.join(CHARACTER_FORMATS)}."
+        )
+    if not path.is_file():
+        raise FormatError(f"{path}: no such file. Check the path.")
+    if suffix in (".glb", ".gltf"):
+        from ._gltf_character import read_gltf_meshes as read
+    elif suffix.startswith(".usd"):
+        from ._usd_character import read_usd_meshes as read
+    elif suffix == ".npz":
+        read = _read_npz
+    else:
+        read = _read_cache
+    parts, rate, up = read(path, fps)
+    whole = _joined(_picked(path, parts, mesh))
+    if whole.positions.size > _MOST:
+        raise FormatError(f"{path}: {whole.positions.size:,} coordinates. Cut the clip.")
+    if not np.isfinite(whole.positions).all():
+        raise FormatError(f"{path}: positions that aren't finite. Export it again.")
+    rate = source_fps or rate or 30.0
+    return _in_metres(path, _at_rate(whole, float(rate), float(fps), frames), up)
+
+
+def _read_npz(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, str | None]:
+    try:
+        data = read_arrays(path)
+    except ValueError as error:
+        raise FormatError(f"{path}: not an archive of arrays ({error})"[:300] + ".") from None
+    parts = []
+    for key in data:
+        if not key.endswith("positions"):
+            continue
+        prefix = key.removesuffix("positions")
+        faces = data.get(f"{prefix}faces")
+        x = data[key]
+        if faces is None or x.ndim != 3 or x.shape[2] != 3 or not _numbers(x):
+            raise FormatError(
+                f"{path}: '{key}' of shape {x.shape} with no '{prefix}faces' beside it or not"
+                " [frames, vertices, 3]."
+            )
+        _check_faces(path, faces, x.shape[1])
+        parts.append(Moving(prefix.rstrip("_") or "body", x, faces.astype(np.int32)))
+    rate = data.get("fps")
+    if rate is not None and (rate.size != 1 or not _numbers(rate) or not 0 < float(rate) < 1e4):
+        raise FormatError(f"{path}: fps isn't a positive number.")
+    return parts, None if rate is None else float(rate), None
+
+
+def _numbers(x: np.ndarray) -> bool:
+    return np.issubdtype(x.dtype, np.floating) or np.issubdtype(x.dtype, np.integer)
+
+
+def _check_faces(path: pathlib.Path, faces: np.ndarray, vertices: int) -> None:
+    if (
+        faces.ndim != 2
+        or faces.shape[1:] != (3,)
+        or not len(faces)
+        or not np.issubdtype(faces.dtype, np.integer)
+        or faces.min() < 0
+        or faces.max() >= vertices
+    ):
+        raise FormatError(f"{path}: its faces aren't triangles over {vertices} vertices.")
+
+
+def _read_cache(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, str | None]:
+    beside = path.with_suffix(".obj")
+    if not beside.is_file():
+        raise FormatError(
+            f"{path}: a cache has points alone; put the OBJ of its faces beside it, {beside.name}."
+        )
+    rate: float | None = None
+    if path.suffix.lower() == ".pc2":
+        positions = read_pc2(path)
+    else:
+        positions, times = read_mdd(path)
+        step = np.diff(times)
+        if len(step) and np.isfinite(step).all() and np.median(step) > 1e-4:
+            rate = float(1.0 / np.median(step))
+    shape = read_obj(beside)
+    if len(shape.vertices) != positions.shape[1]:
+        raise FormatError(
+            f"{path}: {positions.shape[1]} points, but {beside.name} has {len(shape.vertices)}"
+            " vertices. Export both from one mesh, vertex order kept."
+        )
+    return [Moving("body", positions, shape.faces, shape.uv, shape.uv_faces)], rate, None
+
+
+def _picked(path: pathlib.Path, parts: Sequence[Moving], mesh: str | None) -> list[Moving]:
+    if not parts:
+        raise FormatError(f"{path}: no mesh that moves. Export the person with its animation.")
+    names = ", ".join(sorted({p.name for p in parts}))[:300]
+    if mesh is not None:
+        chosen = [p for p in parts if p.name == mesh]
+        if not chosen:
+            raise FormatError(f"{path}: no mesh '{mesh}'; there are {names}.")
+        return chosen
+    return [p for p in parts if p.name.lower() == "body"] or list(parts)
+
+
+def _joined(parts: Sequence[Moving]) -> Moving:
+    if len(parts) == 1:
+        return parts[0]
+    first = np.cumsum([0, *(p.positions.shape[1] for p in parts)])
+    faces = [p.faces + n for p, n in zip(parts, first[:-1], strict=True)]
+    binds = [p.bind for p in parts]
+    uv = uv_faces = None
+    if all(p.uv is not None and p.uv_faces is not None for p in parts):
+        starts = np.cumsum([0, *(len(p.uv) for p in parts if p.uv is not None)])
+        uv = np.concatenate([p.uv for p in parts if p.uv is not None])
+        uv_faces = np.concatenate(
+            [p.uv_faces + n for p, n in zip(parts, starts) if p.uv_faces is not None]
+        )
+    return Moving(
+        "body",
+        np.concatenate([p.positions for p in parts], axis=1),
+        np.concatenate(faces),
+        uv,
+        uv_faces,
+        None
+        if any(b is None for b in binds)
+        else np.concatenate([b for b in binds if b is not None]),
+    )
+
+
+def _at_rate(moving: Moving, rate: float, fps: float, frames: int | None) -> Moving:
+    """The clip at another rate, linear between its frames."""
+    x = moving.positions
+    count = int((len(x) - 1) * fps / rate + 1e-6) + 1
+    count = count if frames is None else min(count, frames)
+    at = np.arange(count) * rate / fps
+    low = np.minimum(at.astype(int), len(x) - 1)
+    high = np.minimum(low + 1, len(x) - 1)
+    t = (at - low)[:, None, None]
+    between = x[low] + t * (x[high] - x[low]) if t.any() else x[low]
+    return dataclasses.replace(moving, positions=between.astype(np.float32))
+
+
+def _in_metres(
+    path: pathlib.Path, moving: Moving, up: str | None
+) -> tuple[AnimatedMesh, Float[np.ndarray, "vertices 3"] | None, tuple[str, ...]]:
+    """Metres and Y up, by what the file says or by how high a person is."""
+    x = moving.positions
+    extent = np.ptp(x[0], axis=0)
+    notes = []
+    if up is None:
+        up = "Z" if extent[2] > extent[1] else "Y"
+        if up == "Z":
+            notes.append("Z is up: the person is higher along it than along Y")
+    height = float(extent[2 if up == "Z" else 1])
+    fitting = [n for n, s in _UNITS.items() if _HEIGHTS[0] <= s * height <= _HEIGHTS[1]]
+    if not fitting:
+        raise FormatError(
+            f"{path}: {height:.3g} high in its first frame, which is no person's height in"
+            f" {', '.join(_UNITS)}. Scale it, or choose its body with --body-mesh."
+        )
+    if fitting[0] != "m":
+        notes.append(f"the unit is {fitting[0]}: the person is {height:.3g} high")
+    scale = _UNITS[fitting[0]]
+
+    def turned(p: np.ndarray) -> np.ndarray:
+        p = p[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0], p.dtype) if up == "Z" else p
+        return (p * p.dtype.type(scale)).astype(np.float32)
+
+    bind = None if moving.bind is None else turned(moving.bind)
+    mesh = AnimatedMesh(
+        "body", turned(x), moving.faces, moving.uv, moving.uv_faces, (0.69, 0.46, 0.33)
+    )
+    return mesh, bind, tuple(notes)

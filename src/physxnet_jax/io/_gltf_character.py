@@ -1,0 +1,185 @@
+"""Meshes of a glTF as its animation moves them: skins and morph targets."""
+
+import pathlib
+
+import numpy as np
+from jaxtyping import Float
+
+from ..errors import FormatError, PhysXNetError
+from ..motion import GltfFile
+from ._character import Moving
+
+_TRIANGLES = 4
+# Skinned vertices times frames and joints that are computed.
+_MOST = 3e8
+
+
+def read_gltf_meshes(
+    path: pathlib.Path, fps: float
+) -> tuple[list[Moving], float | None, str | None]:
+    """Every mesh that a skin or morph targets move; all that stand still if none does.
+
+    Args:
+        path: The file.
+        fps: Frames a second at which the animation is read.
+
+    Returns:
+        The meshes, their rate, and the axis that is up.
+
+    Raises:
+        FormatError: A mesh without triangles, weights that don't fit.
+        MotionError: A damaged file.
+
+    References:
+        Khronos, glTF 2.0, sections 3.7.2 (meshes) and 3.7.3 (skins).
+    """
+    try:
+        return _read(path, fps)
+    except (PhysXNetError, OSError):
+        raise
+    except (TypeError, ValueError, AttributeError, LookupError, OverflowError) as error:
+        raise FormatError(
+            f"{path}: damaged glTF ({type(error).__name__}: {error})"[:300]
+        ) from error
+
+
+def _read(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, str | None]:
+    file = GltfFile(path)
+    times = file.frame_times(rate=fps)[0]
+    world, still = file.world(times), file.world()[0]
+    parts: list[Moving] = []
+    for n, node in enumerate(file.document.nodes):
+        if node.mesh is None:
+            continue
+        mesh = file.document.meshes[file.index(node.mesh, file.document.meshes, "mesh")]
+        weights = file.morph_weights(n, times)
+        for primitive in mesh.primitives:
+            if (primitive.mode if primitive.mode is not None else _TRIANGLES) != _TRIANGLES:
+                continue
+            name = str(node.name or mesh.name or f"mesh{node.mesh}")
+            part = _primitive(file, primitive, name, weights)
+            if node.skin is not None:
+                part = _skinned(file, node.skin, primitive, part, world, still)
+            else:
+                part = _moved(part, world[:, n])
+            parts.append(part)
+    moving = [p for p in parts if p.bind is not None] or parts
+    return [_welded(p) for p in moving], float(fps), "Y"
+
+
+def _primitive(
+    file: GltfFile,
+    primitive: object,
+    name: str,
+    weights: Float[np.ndarray, "frames targets"] | None,
+) -> Moving:
+    attributes = primitive.attributes  # pyright: ignore[reportAttributeAccessIssue]
+    x = np.asarray(file.accessor(attributes.POSITION), np.float32)
+    if x.ndim != 2 or x.shape[1] != 3:
+        raise FormatError(f"{file.path}: positions of '{name}' aren't points.")
+    if primitive.indices is None:  # pyright: ignore[reportAttributeAccessIssue]
+        faces = np.arange(len(x) // 3 * 3)
+    else:
+        faces = np.asarray(file.accessor(primitive.indices))  # pyright: ignore[reportAttributeAccessIssue]
+    if faces.ndim != 1 or not len(faces) or len(faces) % 3 or faces.max() >= len(x):
+        raise FormatError(f"{file.path}: faces of '{name}' aren't triangles over its vertices.")
+    faces = faces.reshape(-1, 3).astype(np.int32)
+    positions = x[None]
+    targets = primitive.targets or ()  # pyright: ignore[reportAttributeAccessIssue]
+    if weights is not None and len(targets):
+        offsets = np.zeros((len(targets), *x.shape), np.float32)
+        for k, target in enumerate(targets):
+            which = target["POSITION"] if isinstance(target, dict) else target.POSITION
+            if which is not None:
+                offsets[k] = file.accessor(which)
+        if weights.shape[1] != len(targets):
+            raise FormatError(f"{file.path}: {len(targets)} morph targets of '{name}' don't fit.")
+        positions = x + np.einsum("ft,tvc->fvc", weights.astype(np.float32), offsets)
+    uv = None
+    if attributes.TEXCOORD_0 is not None:
+        uv = np.asarray(file.accessor(attributes.TEXCOORD_0), float)
+        # Images begin at the top in glTF.
+        uv = uv * [1.0, -1.0] + [0.0, 1.0] if uv.shape == (len(x), 2) else None
+    return Moving(name, positions, faces, uv, None if uv is None else faces)
+
+
+def _moved(part: Moving, world: Float[np.ndarray, "frames 4 4"]) -> Moving:
+    """A mesh moved as a whole by its node."""
+    x = np.broadcast_to(part.positions, (len(world), *part.positions.shape[1:]))
+    turned = np.einsum("fab,fvb->fva", world[:, :3, :3], x) + world[:, None, :3, 3]
+    return Moving(part.name, turned.astype(np.float32), part.faces, part.uv, part.uv_faces)
+
+
+def _skinned(
+    file: GltfFile,
+    which: int,
+    primitive: object,
+    part: Moving,
+    world: Float[np.ndarray, "frames nodes 4 4"],
+    still: Float[np.ndarray, "nodes 4 4"],
+) -> Moving:
+    skin = file.document.skins[file.index(which, file.document.skins, "skin")]
+    joints = [file.index(j, file.document.nodes, "joint") for j in skin.joints]
+    binds = np.tile(np.eye(4), (len(joints), 1, 1))
+    if skin.inverseBindMatrices is not None:
+        told = np.asarray(file.accessor(skin.inverseBindMatrices), float)
+        if told.shape != (len(joints), 16) or not np.isfinite(told).all():
+            raise FormatError(f"{file.path}: bind matrices of '{part.name}' don't fit its joints.")
+        binds = told.reshape(-1, 4, 4).swapaxes(1, 2)
+    weights = _joint_weights(file, primitive, part, len(joints))
+    frames, vertices = len(world), part.positions.shape[1]
+    if frames * vertices * 12.0 > _MOST:
+        raise FormatError(f"{file.path}: {frames} frames of {vertices:,} vertices. Cut the clip.")
+    matrices = world[:, joints] @ binds
+    out = np.zeros((frames, vertices, 3), np.float32)
+    x = np.broadcast_to(part.positions, (frames, vertices, 3))
+    for f in range(frames):
+        blend = (weights @ matrices[f, :, :3].reshape(len(joints), 12)).reshape(-1, 3, 4)
+        out[f] = np.einsum("vab,vb->va", blend[:, :, :3], x[f]) + blend[:, :, 3]
+    # The mesh itself is as it was bound; the topmost joint says where that stands.
+    rank = {n: k for k, n in enumerate(file.order)}
+    top = min(range(len(joints)), key=lambda k: rank[joints[k]])
+    place = still[joints[top]] @ binds[top]
+    bind = part.positions[0] @ place[:3, :3].T + place[:3, 3]
+    return Moving(part.name, out, part.faces, part.uv, part.uv_faces, bind.astype(np.float32))
+
+
+def _joint_weights(
+    file: GltfFile, primitive: object, part: Moving, joints: int
+) -> Float[np.ndarray, "vertices joints"]:
+    vertices = part.positions.shape[1]
+    out = np.zeros((vertices, joints))
+    attributes = primitive.attributes  # pyright: ignore[reportAttributeAccessIssue]
+    for k in range(4):
+        which = getattr(attributes, f"JOINTS_{k}", None)
+        share = getattr(attributes, f"WEIGHTS_{k}", None)
+        if which is None or share is None:
+            continue
+        which, share = np.asarray(file.accessor(which)), np.asarray(file.accessor(share), float)
+        if which.shape != (vertices, 4) or share.shape != (vertices, 4) or which.max() >= joints:
+            raise FormatError(f"{file.path}: skin weights of '{part.name}' don't fit its vertices.")
+        np.add.at(out, (np.arange(vertices)[:, None], which.astype(int)), share)
+    total = out.sum(axis=1, keepdims=True)
+    if not np.isfinite(out).all() or (total <= 0).any():
+        raise FormatError(f"{file.path}: vertices of '{part.name}' hang on no joint.")
+    return out / total
+
+
+def _welded(part: Moving) -> Moving:
+    """Vertices that were doubled at texture seams become one again."""
+    place = part.positions[0] if part.bind is None else part.bind
+    both = np.concatenate([place, part.positions[-1]], axis=1)
+    keys = np.round(both / max(float(np.ptp(place, axis=0).max()), 1e-9) * 1e6)
+    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    faces = index.reshape(-1)[part.faces].astype(np.int32)
+    whole = (
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
+    return Moving(
+        part.name,
+        part.positions[:, first],
+        faces[whole],
+        part.uv,
+        None if part.uv_faces is None else part.uv_faces[whole],
+        None if part.bind is None else part.bind[first],
+    )

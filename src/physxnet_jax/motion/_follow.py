@@ -1,0 +1,89 @@
+"""Motion of the skeleton from a surface that moves."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from ..body import NUM_BODY_VERTICES, Body
+from ..errors import MotionError
+from ._motion import Motion, make_motion
+from ._retarget import continuous
+
+# Vertices that belong to a joint in all; with fewer it moves as its parent does.
+_FEWEST = 12.0
+
+
+def follow_surface(
+    body: Body,
+    surface: Float[np.ndarray, "frames vertices 3"],
+    sure: Bool[np.ndarray, " vertices"],
+    fps: float,
+    *,
+    name: str = "surface",
+) -> Motion:
+    """The joint rotations with which the body's skin comes nearest to a moving surface.
+
+    From the hips outwards, every joint turns so that the vertices that hang on it lie as
+    near as they can to where they are on the surface (a closed form). What skinning can't
+    follow is left over.
+
+    Args:
+        body: The body, in the proportions of the surface.
+        surface: Where its vertices are [m], shape [frames, 13380, 3].
+        sure: Vertices that count, shape [13380].
+        fps: Frames a second.
+        name: Name of the motion.
+
+    Returns:
+        The motion.
+
+    Raises:
+        MotionError: No vertex of the hips counts.
+
+    References:
+        Kabsch, A solution for the best rotation to relate two sets of vectors (1976).
+    """
+    rest = np.asarray(body.rest_vertices(body.default_shape()), np.float64)
+    heads = np.asarray(body.joint_positions(jnp.asarray(rest, jnp.float32))[0], np.float64)
+    # Squared: vertices that hang on two joints count little for either.
+    share = np.where(sure[:, None], np.asarray(body.weights)[:NUM_BODY_VERTICES] ** 2, 0.0)
+    frames = len(surface)
+    world = np.zeros((frames, len(body.parents), 3, 3))
+    at = np.zeros((frames, len(body.parents), 3))
+    for j, parent in enumerate(body.parents):
+        rows = np.flatnonzero(share[:, j] > 1e-3)
+        weight = share[rows, j].astype(np.float64)
+        known = weight.sum() >= _FEWEST
+        x, y = rest[rows], surface[:, rows].astype(np.float64)
+        if parent < 0:
+            if not known:
+                raise MotionError(f"{name}: nothing of the surface belongs to the hips.")
+            weight /= weight.sum()
+            middle, moved = weight @ x, np.einsum("v,fvc->fc", weight, y)
+            world[:, j] = _best_turn(weight, x - middle, y - moved[:, None])
+            at[:, j] = moved + world[:, j] @ (heads[j] - middle)
+            continue
+        at[:, j] = at[:, parent] + world[:, parent] @ (heads[j] - heads[parent])
+        world[:, j] = world[:, parent]
+        if known:
+            world[:, j] = _best_turn(weight, x - heads[j], y - at[:, j, None])
+    local = world.copy()
+    for j, parent in enumerate(body.parents):
+        if parent >= 0:
+            local[:, j] = np.swapaxes(world[:, parent], 1, 2) @ world[:, j]
+    turns = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    return make_motion(continuous(turns.reshape(frames, -1, 4)), at[:, 0], fps, name=name)
+
+
+def _best_turn(
+    weight: Float[np.ndarray, " rows"],
+    x: Float[np.ndarray, "rows 3"],
+    y: Float[np.ndarray, "frames rows 3"],
+) -> Float[np.ndarray, "frames 3 3"]:
+    """Rotations R that bring R x nearest to y."""
+    covariance = np.einsum("v,fva,vb->fab", weight, y, x, optimize=True)
+    u, _, v = np.linalg.svd(covariance)
+    sign = np.sign(np.linalg.det(u @ v))
+    u[:, :, 2] *= np.where(sign == 0, 1.0, sign)[:, None]
+    return u @ v

@@ -1,0 +1,123 @@
+"""People of one's own, dressed: against the same clothes on the person they were made from."""
+
+import dataclasses
+
+import fast_simplification
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.body import linear_blend_skinning
+from physxnet_jax.cli import main
+from physxnet_jax.dressing import dress, make_character
+from physxnet_jax.errors import MeshError, PhysXNetError
+from physxnet_jax.garment import template
+from physxnet_jax.geometry import closest_points, make_mesh
+from physxnet_jax.io import AnimatedMesh
+from physxnet_jax.motion import Motion, body_animation, load_motion
+
+FPS = 10.0
+
+
+def rmse(a, b):
+    return float(np.sqrt(((a - b) ** 2).sum(axis=-1).mean()))
+
+
+@pytest.fixture(scope="module")
+def man(body):
+    """A tall man who punches, in the triangles of a stranger; his bind pose is a T."""
+    shape = body.shape(gender=1.0, height_up=0.7, muscle_up=0.5)
+    clip = load_motion("punch", fps=FPS, shape=shape)
+    clip = Motion(clip.rotations[:8], clip.root[:8], FPS, "punch")
+    rest = body.rest_vertices(shape)
+    world, shift = body.transforms(rest, body.t_pose(shape), jnp.asarray([0.0, 1.0, 0.0]))
+    n = 13380
+    bind = np.asarray(linear_blend_skinning(rest[:n], body.weights[:n], world, shift))
+    faces = np.asarray(body.rest_mesh().faces)
+    vertices, other = fast_simplification.simplify(
+        np.array(bind), np.array(faces), target_count=12000
+    )
+    foot = closest_points(make_mesh(bind, faces), jnp.asarray(vertices, jnp.float32))
+    x = np.asarray(body_animation(body, clip, shape))[:, faces[np.asarray(foot.face)]]
+    x = np.einsum("vk,fvkc->fvc", np.asarray(foot.weights), x)
+    mesh = AnimatedMesh("me", x.astype(np.float32), other.astype(np.int32))
+    return shape, clip, mesh, vertices.astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def character(man):
+    _, _, mesh, bind = man
+    return make_character(mesh, FPS, bind=bind)
+
+
+def test_a_stranger_wears_what_he_would_wear(man, character):
+    shape, clip, mesh, _ = man
+    assert character.apart < 0.008 and character.missed < 0.01
+    worn = dress(character, ["top", "bottom"], method="lbs")
+    true = dress(clip, ["top", "bottom"], method="lbs", shape=shape, fps=FPS)
+    other = dress(clip, ["top", "bottom"], method="lbs", fps=FPS)
+    np.testing.assert_array_equal(worn.meshes[0].positions, mesh.positions)
+    np.testing.assert_array_equal(worn.meshes[0].faces, mesh.faces)
+    assert worn.fps == FPS and "mm from yours" in worn.notes[0]
+    for a, b, wrong in zip(worn.garments, true.garments, other.garments, strict=True):
+        assert a.name == b.name and rmse(a.positions, b.positions) < 0.02
+        # The control: on another person's shape they are elsewhere.
+        assert rmse(wrong.positions, b.positions) > 0.04
+    assert worn.inside["bottom"] < 0.01 and worn.inside["top"] < 0.04
+
+
+def test_network_and_simulation_dress_him_too(man, character):
+    shape, clip, _, _ = man
+    worn = dress(character, ["bottom"], weights="nano", include_body=False)
+    true = dress(clip, ["bottom"], weights="nano", shape=shape, fps=FPS)
+    assert rmse(worn.garments[0].positions, true.garments[0].positions) < 0.025
+    assert [m.name for m in worn.meshes] == ["bottom"]
+    ways = {"method": "simulate", "accuracy": "draft", "frames": 3}
+    slow = dress(character, ["bottom"], **ways)
+    assert slow.num_frames == 3 and len(slow.meshes[0].positions) == 3
+    same = dress(clip, ["bottom"], shape=shape, fps=FPS, **ways)
+    assert rmse(slow.garments[0].positions, same.garments[0].positions) < 0.025
+
+
+def test_cloth_goes_along_with_what_no_joint_moves(character):
+    """A belly that swells by 3 cm takes the shirt with it; without that it doesn't."""
+    rest = np.asarray(character.body.rest_vertices(character.body.default_shape()))[:13380]
+    belly = np.exp(
+        -0.5 * (np.linalg.norm(rest - (0.0, rest[:, 1].mean(), 0.12), axis=1) / 0.1) ** 2
+    )
+    swell = np.zeros_like(character.leftover)
+    swell[-1] = 0.03 * belly[:, None] * [0.0, 0.0, 1.0]
+    flat = dress(character, ["top"], method="lbs").garments[0].positions
+    grown = dataclasses.replace(character, leftover=character.leftover + swell)
+    out = dress(grown, ["top"], method="lbs").garments[0].positions - flat
+    np.testing.assert_allclose(out[:-1], 0.0, atol=1e-6)
+    assert 0.015 < out[-1, :, 2].max() <= 0.0301
+    assert np.abs(out[-1, :, :2]).max() < 1e-6
+
+
+def test_what_a_character_brings_cannot_be_given(body, man, character):
+    with pytest.raises(PhysXNetError, match="leave out body and shape"):
+        dress(character, ["top"], shape=body.default_shape())
+    _, _, mesh, _ = man
+    squashed = dataclasses.replace(mesh, positions=mesh.positions * np.float32([1.0, 0.2, 1.0]))
+    with pytest.raises(MeshError, match="can't be laid"):
+        make_character(squashed, FPS)
+
+
+def test_the_command_dresses_a_file(man, tmp_path, capsys):
+    _, _, mesh, bind = man
+    x = np.concatenate([bind[None], mesh.positions[:3]])[..., [0, 2, 1]] * [100.0, -100.0, 100.0]
+    np.savez(tmp_path / "me.npz", me_positions=x, me_faces=mesh.faces, fps=FPS)
+    out = tmp_path / "out.npz"
+    words = ["dress", str(tmp_path / "me.npz"), "--own-body", "--wear", "bottom", "--fps", "10"]
+    assert main([*words, "--method", "lbs", "-o", str(out)]) == 0
+    told = capsys.readouterr().out
+    assert "the unit is cm" in told and "Z is up" in told
+    with np.load(out) as data:
+        np.testing.assert_allclose(data["body_positions"][1:], mesh.positions[:3], atol=1e-4)
+        low = data["bottom_positions"][..., 1].min() - data["body_positions"][..., 1].min()
+        assert data["bottom_positions"].shape == (4, template("bottom").num_vertices, 3)
+        assert 0.0 < low < 0.2
+    assert main([*words, "--shape", "gender=1"]) == 2
+    assert main(["dress", "walk", "--body-mesh", "me"]) == 2
+    assert main(["dress", "walk", "--own-body"]) == 2

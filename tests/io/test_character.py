@@ -1,0 +1,251 @@
+"""People from other programs: every format says the same, in any unit and axes."""
+
+import json
+import struct
+
+import numpy as np
+import pygltflib
+import pytest
+from scipy.spatial.transform import Rotation
+
+from physxnet_jax.errors import FormatError, PhysXNetError
+from physxnet_jax.io import AnimatedMesh, read_character, write_clip, write_obj, write_pc2
+
+# A figure of a few triangles, as high as a person.
+POINTS = np.array(
+    [[0, 0, 0], [0.4, 0, 0], [0.4, 1.7, 0.1], [0, 1.7, 0], [0.2, 0.9, 0.3]], np.float32
+)
+FACES = np.array([[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]], np.int32)
+
+
+@pytest.fixture
+def clip():
+    sway = 0.1 * np.sin(np.arange(7.0))[:, None, None] * POINTS[:, 1:2] * [1.0, 0.0, 0.5]
+    return (POINTS + sway).astype(np.float32)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".usdc", ".usda", ".glb", ".pc2", ".mdd"])
+def test_what_is_written_is_read_again(clip, tmp_path, suffix):
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0.5, 0.5]])
+    body = AnimatedMesh("body", clip, FACES, uv, FACES)
+    shirt = AnimatedMesh("shirt", clip[:, :4] + 1, FACES[:, [0, 1, 2]] % 4)
+    meshes = [body] if suffix in (".pc2", ".mdd") else [shirt, body]
+    write_clip(tmp_path / f"a{suffix}", meshes, 30.0)
+    path = tmp_path / (f"a_body{suffix}" if len(meshes) == 1 else f"a{suffix}")
+    mesh, bind, notes = read_character(path, fps=30.0)
+    assert mesh.name == "body" and bind is None and notes == ()
+    assert mesh.positions.shape == clip.shape and mesh.positions.dtype == np.float32
+    # glTF doubles vertices at seams, and their order may change: compare triangles.
+    np.testing.assert_allclose(mesh.positions[:, mesh.faces], clip[:, FACES], atol=1e-5)
+    if suffix in (".npz", ".usdc", ".glb"):
+        other = read_character(path, mesh="shirt")[0]
+        np.testing.assert_allclose(other.positions.mean(), shirt.positions.mean(), atol=1e-4)
+        with pytest.raises(FormatError, match="no mesh 'hat'; there are body, shirt"):
+            read_character(path, mesh="hat")
+
+
+@pytest.mark.parametrize("unit, scale", [("cm", 100.0), ("mm", 1000.0), ("inches", 1 / 0.0254)])
+def test_unit_and_axes_are_found(clip, tmp_path, unit, scale):
+    upright = clip[..., [0, 2, 1]] * [1.0, -1.0, 1.0] * scale
+    np.savez(tmp_path / "me.npz", positions=upright, faces=FACES, fps=30.0)
+    mesh, _, notes = read_character(tmp_path / "me.npz")
+    np.testing.assert_allclose(mesh.positions, clip, atol=1e-5)
+    assert "Z is up" in notes[0] and f"the unit is {unit}" in notes[1]
+
+
+def test_rate_and_length(clip, tmp_path):
+    np.savez(tmp_path / "me.npz", positions=clip, faces=FACES, fps=60.0)
+    half = read_character(tmp_path / "me.npz", fps=30.0)[0].positions
+    np.testing.assert_allclose(half, clip[::2], atol=1e-6)
+    double = read_character(tmp_path / "me.npz", fps=120.0)[0].positions
+    assert len(double) == 13
+    np.testing.assert_allclose(double[1::2], 0.5 * (clip[1:] + clip[:-1]), atol=1e-6)
+    assert len(read_character(tmp_path / "me.npz", fps=60.0, frames=3)[0].positions) == 3
+    write_pc2(tmp_path / "me.pc2", clip)
+    write_obj(tmp_path / "me.obj", clip[0], FACES)
+    slow = read_character(tmp_path / "me.pc2", fps=30.0, source_fps=15.0)[0].positions
+    np.testing.assert_allclose(slow[::2], clip, atol=1e-6)
+
+
+def skinned(
+    path, *, turn, scale, joints_of=None, weights=((1, 0), (1, 0), (0, 1), (0, 1), (0.5, 0.5))
+):
+    """Two joints: the upper one nods; the armature scales and turns, as Blender's do."""
+    g = pygltflib.GLTF2(scene=0, scenes=[pygltflib.Scene(nodes=[0, 3])])
+    blob = bytearray()
+
+    def put(values, kind, component=5126):
+        raw = np.ascontiguousarray(values).tobytes()
+        blob.extend(b"\0" * (-len(blob) % 4))
+        g.bufferViews.append(
+            pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(raw))
+        )
+        blob.extend(raw)
+        g.accessors.append(
+            pygltflib.Accessor(
+                bufferView=len(g.bufferViews) - 1, componentType=component, count=len(values),
+                type=kind,
+            )
+        )  # fmt: skip
+        return len(g.accessors) - 1
+
+    g.nodes = [
+        pygltflib.Node(
+            name="Armature", children=[1], scale=[scale] * 3, rotation=turn.as_quat().tolist()
+        ),
+        pygltflib.Node(name="low", children=[2], translation=[0, 0, 0]),
+        pygltflib.Node(name="high", translation=[0.0, 0.9 / scale, 0.0]),
+        pygltflib.Node(name="figure", mesh=0, skin=0, translation=[9.0, 9.0, 9.0]),
+    ]
+    local = np.linalg.inv(np.diag([scale, scale, scale, 1.0]))
+    # Bound in the armature's own space, upright.
+    binds = []
+    for height in (0.0, 0.9):
+        m = np.eye(4)
+        m[1, 3] = -height / scale
+        binds.append((m @ local).T)
+    which = np.tile(np.array([0, 1, 0, 0], np.uint8), (5, 1))
+    share = np.zeros((5, 4), np.float32)
+    share[:, :2] = weights
+    attributes = pygltflib.Attributes(
+        POSITION=put(POINTS, "VEC3"),
+        JOINTS_0=put(which, "VEC4", 5121),
+        WEIGHTS_0=put(share, "VEC4"),
+    )
+    g.meshes = [
+        pygltflib.Mesh(
+            primitives=[
+                pygltflib.Primitive(
+                    attributes=attributes,
+                    indices=put(FACES.reshape(-1).astype(np.uint16), "SCALAR", 5123),
+                )
+            ]
+        )
+    ]
+    g.skins = [
+        pygltflib.Skin(
+            joints=joints_of or [1, 2],
+            inverseBindMatrices=put(np.stack(binds).astype(np.float32).reshape(2, 16), "MAT4"),
+        )
+    ]
+    times = put(np.array([0.0, 1.0], np.float32), "SCALAR")
+    nod = np.stack([Rotation.identity().as_quat(), Rotation.from_euler("Z", 0.5).as_quat()])
+    g.animations = [
+        pygltflib.Animation(
+            samplers=[
+                pygltflib.AnimationSampler(input=times, output=put(nod.astype(np.float32), "VEC4"))
+            ],
+            channels=[
+                pygltflib.AnimationChannel(
+                    sampler=0, target=pygltflib.AnimationChannelTarget(node=2, path="rotation")
+                )
+            ],
+        )
+    ]
+    g.set_binary_blob(bytes(blob))
+    g.buffers.append(pygltflib.Buffer(byteLength=len(blob)))
+    g.save(str(path))
+    return path
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.01])
+@pytest.mark.parametrize("degrees", [0.0, 35.0])
+def test_a_skin_moves_its_vertices(tmp_path, scale, degrees):
+    """Against the formula: weighted turns about the joint; the mesh's own node doesn't count."""
+    turn = Rotation.from_euler("Y", degrees, degrees=True)
+    path = skinned(tmp_path / "a.glb", turn=turn, scale=scale)
+    mesh, bind, notes = read_character(path, fps=10.0)
+    assert mesh.positions.shape == (11, 5, 3) and notes == ()
+    order = np.lexsort(POINTS.T)
+    for k, angle in ((0, 0.0), (5, 0.25), (10, 0.5)):
+        nod = Rotation.from_euler("Z", angle).as_matrix()
+        high = (POINTS - [0, 0.9, 0]) @ nod.T + [0, 0.9, 0]
+        share = np.array([0, 0, 1, 1, 0.5])[:, None]
+        expected = ((1 - share) * POINTS + share * high) @ turn.as_matrix().T
+        seen = mesh.positions[k][np.lexsort((bind @ turn.as_matrix()).round(5).T)]
+        np.testing.assert_allclose(seen, expected[order], atol=1e-5)
+    np.testing.assert_allclose(
+        np.sort(bind, axis=0), np.sort(POINTS @ turn.as_matrix().T, axis=0), atol=1e-5
+    )
+
+
+def test_a_skin_that_does_not_fit_is_refused(tmp_path):
+    turn = Rotation.identity()
+    none = ((0, 0),) * 5
+    with pytest.raises(FormatError, match="hang on no joint"):
+        read_character(skinned(tmp_path / "a.glb", turn=turn, scale=1.0, weights=none))
+    with pytest.raises(PhysXNetError, match="joint 77"):
+        read_character(skinned(tmp_path / "b.glb", turn=turn, scale=1.0, joints_of=[1, 77]))
+
+
+def test_a_usd_skin_is_baked(tmp_path):
+    from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 0.01)
+    stage.SetTimeCodesPerSecond(10)
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(1)
+    root = UsdSkel.Root.Define(stage, "/Me")
+    skeleton = UsdSkel.Skeleton.Define(stage, "/Me/Bones")
+    skeleton.CreateJointsAttr(["low"])
+    one = Vt.Matrix4dArray([Gf.Matrix4d(1)])
+    skeleton.CreateBindTransformsAttr(one)
+    skeleton.CreateRestTransformsAttr(one)
+    motion = UsdSkel.Animation.Define(stage, "/Me/Bones/Clip")
+    motion.CreateJointsAttr(["low"])
+    motion.CreateRotationsAttr().Set(Vt.QuatfArray([Gf.Quatf(1)]))
+    motion.CreateScalesAttr().Set(Vt.Vec3hArray([Gf.Vec3h(1)]))
+    shift = motion.CreateTranslationsAttr()
+    shift.Set(Vt.Vec3fArray([Gf.Vec3f(0, 0, 0)]), 0)
+    shift.Set(Vt.Vec3fArray([Gf.Vec3f(10, 0, 0)]), 1)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(
+        [motion.GetPath()]
+    )
+    mesh = UsdGeom.Mesh.Define(stage, "/Me/figure")
+    upright = 100 * POINTS[:, [0, 2, 1]] * [1, -1, 1]
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(upright.astype(np.float32)))
+    mesh.CreateFaceVertexCountsAttr([3] * 4)
+    mesh.CreateFaceVertexIndicesAttr(FACES.reshape(-1).tolist())
+    api = UsdSkel.BindingAPI.Apply(mesh.GetPrim())
+    api.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    api.CreateJointIndicesPrimvar(False, 1).Set([0] * 5)
+    api.CreateJointWeightsPrimvar(False, 1).Set([1.0] * 5)
+    assert root
+    stage.Save()
+    found = read_character(tmp_path / "a.usda", fps=10.0)[0]
+    expected = np.stack([POINTS, POINTS + [0.1, 0, 0]])
+    np.testing.assert_allclose(found.positions, expected, atol=1e-5)
+
+
+def test_broken_files_are_refused_in_a_sentence(clip, tmp_path):
+    def refused(match, name, **arrays):
+        if arrays:
+            np.savez(tmp_path / name, **arrays)
+        with pytest.raises(FormatError, match=match):
+            read_character(tmp_path / name)
+
+    refused("no animated person is read from '.fbx'", "a.fbx")
+    refused("no such file", "gone.npz")
+    refused("no mesh that moves", "a.npz", x=clip)
+    refused("triangles over 5", "b.npz", positions=clip, faces=FACES + 2)
+    refused("fps isn't", "c.npz", positions=clip, faces=FACES, fps=-1.0)
+    refused("aren't finite", "d.npz", positions=clip * np.nan, faces=FACES)
+    refused("no person's height", "e.npz", positions=clip * 7e5, faces=FACES)
+    refused("no 'faces'", "f.npz", positions=clip)
+    write_pc2(tmp_path / "g.pc2", clip)
+    refused("put the OBJ", "g.pc2")
+    write_obj(tmp_path / "g.obj", POINTS[:4], np.array([[0, 1, 2]]))
+    refused("5 points, but g.obj has 4", "g.pc2")
+    (tmp_path / "h.usda").write_text("#usda 1.0\n(nonsense")
+    refused("not a USD stage", "h.usda")
+    document = {"asset": {"version": "2.0"}, "nodes": [{"name": "a"}]}
+    blob = json.dumps(document).encode()
+    blob += b" " * (-len(blob) % 4)
+    head = struct.pack("<4sII", b"glTF", 2, 20 + len(blob)) + struct.pack(
+        "<II", len(blob), 0x4E4F534A
+    )
+    (tmp_path / "i.glb").write_bytes(head + blob)
+    with pytest.raises(PhysXNetError, match="no animation"):
+        read_character(tmp_path / "i.glb")
