@@ -18,7 +18,7 @@ import numpy as np
 from physxnet_jax.dressing import load_scene
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.files import whole_file
-from physxnet_jax.io import load_predictor, read_mdd, read_obj, read_pc2
+from physxnet_jax.io import load_predictor, read_character, read_mdd, read_obj, read_pc2
 from physxnet_jax.motion import load_motion, read_joint_map
 
 RESULT = pathlib.Path(__file__).parent / "results/broken_files.md"
@@ -104,6 +104,10 @@ def corpus() -> list[tuple[str, str, bytes, Callable[[pathlib.Path], object]]]:
         ("binary", "a.obj", b"\0\0\0\0", read_obj),
         ("truncated cache", "a.pc2", b"POINTCACHE2\0" + view + b"\0" * 12, read_pc2),
         ("truncated cache", "a.mdd", b"\0\0\0\5\0\0\0\5\0\0", read_mdd),
+        ("a person without faces", "me.npz", archive(positions=np.zeros((2, 9, 3))), read_character),
+        ("of no person's height", "me.npz", archive(positions=np.ones((2, 9, 3)), faces=np.arange(9).reshape(3, 3)), read_character),
+        ("a cache without its faces", "me.pc2", b"POINTCACHE2\0" + view, read_character),
+        ("no stage", "me.usda", b"#usda 1.0\n(", read_character),
         ("unknown effect", "scene.toml", b'motion = "walk"\n[also.magic]\n', load_scene),
         ("wrong kind of value", "scene.toml", b'motion = "walk"\nframes = "ten"\n', load_scene),
         ("unknown weights", "none", b"", lambda path: load_predictor(path.name)),

@@ -17,6 +17,16 @@ EXTRAS = {
     "usd": ("pxr", "from physxnet_jax.io import check_output; check_output('a.usdc')"),
     "gltf": ("pygltflib", "from physxnet_jax.io import check_output; check_output('a.glb')"),
     "render": ("pyvista", "from physxnet_jax.viewer import check_preview; check_preview('a.png')"),
+    "mesh": (
+        "fast_simplification",
+        "from physxnet_jax.garment._repair import decimate;"
+        " from physxnet_jax.garment import template; decimate(template('bottom').mesh, 0.05)",
+    ),
+    "export": (
+        "flatbuffers",
+        "import physxnet_jax as px; from physxnet_jax.dressing import export_dresser;"
+        " export_dresser('dresser', px.make_dresser(['bottom'], weights='nano'))",
+    ),
     "viewer": (
         "viser",
         "from physxnet_jax.viewer._server import start_server; start_server('127.0.0.1', 8400)",
@@ -67,14 +77,26 @@ def test_the_command_works_where_nothing_else_is_installed(python, tmp_path):
     assert "wrote" in out and (tmp_path / "a.npz").is_file()
 
 
-def test_each_extra_is_asked_for_by_name_and_then_enough(python, wheel):
+def test_each_extra_is_asked_for_by_name_and_then_enough(python, wheel, tmp_path):
     for extra, (module, call) in EXTRAS.items():
         script = f"import sys\ntry:\n    {call}\nexcept ImportError as e:\n    print('needs', e)"
-        out = run(python, "-c", script)
+        out = run(python, "-c", script, cwd=tmp_path)
         assert f"physxnet-jax[{extra}]" in out, extra
         run(UV, "pip", "install", "--quiet", "--python", python, f"{wheel}[{extra}]")
-        out = run(python, "-c", script + f"\nprint('{module}' in sys.modules)")
+        out = run(python, "-c", script + f"\nprint('{module}' in sys.modules)", cwd=tmp_path)
         assert "needs" not in out, extra
+
+
+def test_a_run_is_watched_where_the_train_extra_is(python, wheel, tmp_path):
+    """Without it training goes on, unwatched."""
+    script = (
+        "import pathlib; from physxnet_jax.training._watch import Board\n"
+        "b = Board(pathlib.Path('run')); b.write({'loss': 1.0}, 0); b.close()\n"
+        "print(len(list(pathlib.Path('.').rglob('events.*'))))"
+    )
+    assert run(python, "-c", script, cwd=tmp_path).split()[-1] == "0"
+    run(UV, "pip", "install", "--quiet", "--python", python, f"{wheel}[train]")
+    assert run(python, "-c", script, cwd=tmp_path).split()[-1] == "1"
 
 
 def test_importing_loads_nothing_and_names_load_no_optional_library():

@@ -22,6 +22,16 @@ def cached(kind: str) -> None:
     modifier.filepath = str(folder / f"clip_{name}.{kind}")
 
 
+def through_alembic() -> None:
+    """What other programs take from Blender: the stage, exported once more."""
+    bpy.ops.wm.usd_import(filepath=str(folder / "clip.usdc"))
+    path = str(folder / "clip.abc")
+    bpy.ops.wm.alembic_export(filepath=path, start=0, end=frames - 1)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.context.scene.render.fps = 30
+    bpy.ops.wm.alembic_import(filepath=path)
+
+
 def seen() -> np.ndarray:
     mesh = next(o for o in bpy.context.scene.objects if o.type == "MESH")
     shown = mesh.evaluated_get(bpy.context.evaluated_depsgraph_get())
@@ -36,6 +46,7 @@ ways = {
     "glb": lambda: bpy.ops.import_scene.gltf(filepath=str(folder / "clip.glb")),
     "pc2": lambda: cached("pc2"),
     "mdd": lambda: cached("mdd"),
+    "abc": through_alembic,
 }
 found = {}
 for kind, load in ways.items():

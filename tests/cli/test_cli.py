@@ -1,11 +1,15 @@
 """The command: what it writes, what it prints, how it fails."""
 
+import json
+
 import numpy as np
 import pytest
 
 from physxnet_jax._environment import check_jaxlib, jaxlib_problem
 from physxnet_jax.cli import main
 from physxnet_jax.errors import BrokenInstallError
+from physxnet_jax.garment import template
+from physxnet_jax.io import write_obj
 
 
 def test_doctor_and_clips_print_what_there_is(capsys):
@@ -14,6 +18,32 @@ def test_doctor_and_clips_print_what_there_is(capsys):
     assert "jaxlib" in out and "cpu" in out
     assert main(["clips"]) == 0
     assert "side step" in capsys.readouterr().out
+
+
+def test_every_command_that_prints_tables_prints_json(tmp_path, capsys):
+    """One text each, whose numbers are those of the table."""
+
+    def told(*words):
+        code = main([*words, "--json"])
+        return code, json.loads(capsys.readouterr().out)
+
+    assert told("clips")[1]["templates"] == ["top", "bottom", "dress"]
+    code, found = told("doctor")
+    assert code == 0 and found["problem"] is None and "jaxlib" in found["parts"]
+    out = str(tmp_path / "a.npz")
+    common = ["--wear", "bottom", "--frames", "2", "-o", out]
+    code, found = told("dress", "walk", *common, "--method", "lbs")
+    assert code == 0 and found["files"] == [out] and found["frames"] == 2
+    assert found["garments"][0]["vertices"] == 2726 and 0 <= found["garments"][0]["inside"] < 0.1
+    assert {s["name"] for s in found["stages"]} >= {"motion", "skinning"}
+    code, found = told("simulate", "walk", *common, "--accuracy", "draft")
+    assert code == 0 and found["files"] == [out] and "Gravity" in found["effects"]
+    assert found["worst"]["strain_p99"] > 0 and found["seconds"] > 0
+    garment = template("bottom").mesh
+    write_obj(tmp_path / "b.obj", np.asarray(garment.vertices), np.asarray(garment.faces))
+    code, found = told("fit", str(tmp_path / "b.obj"), "-o", str(tmp_path / "c.obj"))
+    assert code == 0 and found["files"] == [str(tmp_path / "c.obj")]
+    assert found["result"]["template"] == "bottom"
 
 
 def test_a_jaxlib_that_miscomputes_is_refused(monkeypatch, capsys):

@@ -233,7 +233,7 @@ def test_broken_files_are_refused_in_a_sentence(clip, tmp_path):
     refused("fps isn't", "c.npz", positions=clip, faces=FACES, fps=-1.0)
     refused("aren't finite", "d.npz", positions=clip * np.nan, faces=FACES)
     refused("no person's height", "e.npz", positions=clip * 7e5, faces=FACES)
-    refused("no 'faces'", "f.npz", positions=clip)
+    refused("'faces' beside it", "f.npz", positions=clip)
     write_pc2(tmp_path / "g.pc2", clip)
     refused("put the OBJ", "g.pc2")
     write_obj(tmp_path / "g.obj", POINTS[:4], np.array([[0, 1, 2]]))

@@ -57,6 +57,8 @@ class Dress:
     """Put the body into the result."""
     push_out: bool = True
     """Push vertices that end inside the body onto it."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -99,6 +101,8 @@ class Fit:
     """Split edges that are longer than this [mm]."""
     decimate: float | None = None
     """Before that, make it coarser: edges of about this length [mm]; drops texture coordinates."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -123,6 +127,8 @@ class Demo:
 class Doctor:
     """Print versions, devices and optional parts; refuse a jaxlib that miscomputes."""
 
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     debug: bool = False
     """Show the trace of an error."""
 
@@ -149,6 +155,8 @@ class Calibrate:
 class Clips:
     """List the built-in clips, templates and weights."""
 
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     debug: bool = False
     """Show the trace of an error."""
 
@@ -192,6 +200,8 @@ class Simulate:
     newton: likewise (PHYSXNET_NEWTON)."""
     body: bool = True
     """Put the body into the result."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False

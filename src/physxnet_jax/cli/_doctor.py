@@ -10,6 +10,7 @@ from rich.table import Table
 
 from .._environment import jaxlib_problem
 from .._version import __version__
+from ._progress import print_json
 
 _REQUIRED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy", "trimesh")
 _OPTIONAL = {
@@ -22,25 +23,29 @@ _OPTIONAL = {
 }
 
 
-def doctor(console: Console) -> int:
+def doctor(console: Console, *, json: bool = False) -> int:
     """Prints versions, devices and optional parts; 1 if jaxlib can't be trusted."""
-    table = Table(title=f"physxnet_jax {__version__}", title_justify="left")
-    table.add_column("part")
-    table.add_column("found")
-    table.add_row("python", f"{platform.python_version()} ({sys.platform}, {platform.machine()})")
-    for name in _REQUIRED:
-        table.add_row(name, _version(name) or "[red]missing[/red]")
-    for name, use in _OPTIONAL.items():
-        table.add_row(name, _version(name) or f"not installed (extra {use})")
+    rows = [("python", f"{platform.python_version()} ({sys.platform}, {platform.machine()})")]
+    rows += [(name, _version(name) or "[red]missing[/red]") for name in _REQUIRED]
+    rows += [(n, _version(n) or f"not installed (extra {use})") for n, use in _OPTIONAL.items()]
     problem = jaxlib_problem(_version("jaxlib") or "", os.environ.get("XLA_FLAGS", ""))
     if problem is None:
         import jax
 
         for device in jax.devices():
-            table.add_row("device", f"{device.platform}: {device.device_kind}")
+            rows.append(("device", f"{device.platform}: {device.device_kind}"))
         from ..io import list_weights
 
-        table.add_row("weights", ", ".join(list_weights()) or "none")
+        rows.append(("weights", ", ".join(list_weights()) or "none"))
+    if json:
+        parts = {name: found.replace("[red]", "").replace("[/red]", "") for name, found in rows}
+        print_json({"version": __version__, "parts": parts, "problem": problem})
+        return int(problem is not None)
+    table = Table(title=f"physxnet_jax {__version__}", title_justify="left")
+    table.add_column("part")
+    table.add_column("found")
+    for row in rows:
+        table.add_row(*row)
     console.print(table)
     if problem is not None:
         console.print(f"[red]{problem}[/red]")

@@ -1,7 +1,6 @@
 """`physxnet inspect` and `physxnet fit`: garment files, looked at and mended."""
 
 import dataclasses
-import json
 import math
 from typing import Any
 
@@ -10,6 +9,7 @@ from rich.table import Table
 
 from ..io import Inspection, fit_garment, inspect_garment
 from ._commands import Fit, Inspect
+from ._progress import print_json
 
 
 def inspect(command: Inspect, console: Console) -> int:
@@ -20,8 +20,7 @@ def inspect(command: Inspect, console: Console) -> int:
         if not command.json:
             _show(found[-1], console)
     if command.json:
-        # One text for machines, whatever the width of the terminal.
-        print(json.dumps([_plain(f) for f in found], indent=1))  # noqa: T201
+        print_json([_plain(f) for f in found])
     return int(any(f.problems for f in found))
 
 
@@ -30,10 +29,14 @@ def fit(command: Fit, console: Console) -> int:
     longest, coarser = (
         None if mm is None else 1e-3 * mm for mm in (command.edge_length, command.decimate)
     )
-    with console.status("fitting"):
+    quiet = Console(quiet=True) if command.json else console
+    with quiet.status("fitting"):
         done, result = fit_garment(
             command.file, command.out, like=command.like, edge_length=longest, coarser=coarser
         )
+    if command.json:
+        print_json({"done": done, "result": _plain(result), "files": [command.out]})
+        return int(bool(result.problems))
     for step in done:
         console.print(step, highlight=False)
     _show(result, console)

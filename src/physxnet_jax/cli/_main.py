@@ -24,7 +24,7 @@ from ._commands import (
 )
 from ._doctor import doctor
 from ._experiment_commands import Bench, Dataset, Evaluate, Stress, Train
-from ._progress import progress_bars
+from ._progress import print_json, progress_bars
 
 _Command = (
     Annotated[Dress, tyro.conf.subcommand("dress")]
@@ -143,12 +143,16 @@ def _run(
 
         return stress(command, Console(quiet=True) if command.quiet else console)
     if isinstance(command, Doctor):
-        return doctor(console)
+        return doctor(console, json=command.json)
     if isinstance(command, Clips):
         from ..garment import TEMPLATES
         from ..io import list_weights
         from ..motion import CLIPS
 
+        if command.json:
+            found = {"clips": list(CLIPS), "templates": TEMPLATES, "weights": list_weights()}
+            print_json(found)
+            return 0
         console.print("clips:    ", ", ".join(CLIPS))
         console.print("templates:", ", ".join(TEMPLATES))
         console.print("weights:  ", ", ".join(list_weights()))
@@ -182,7 +186,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     from ..motion import load_motion
     from ..viewer import check_preview, render_preview
     from ._calibrate import choose
-    from ._table import closing_table
+    from ._table import closing_table, report
 
     # Say what can't be written before minutes are spent.
     if command.out is not None:
@@ -194,7 +198,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
         raise PhysXNetError("--own-body brings its shape along: leave out --shape and --joint-map.")
     if command.body_mesh is not None and not command.own_body:
         raise PhysXNetError("--body-mesh chooses a mesh for --own-body: add that.")
-    if command.quiet:
+    if command.quiet or command.json:
         console = Console(quiet=True)
     with progress_bars(console) as progress:
         if command.own_body:
@@ -244,6 +248,10 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
         pictures = [p for p in (command.preview, still) if p is not None]
         for picture in pictures:
             written.append(render_preview(picture, clip.meshes, clip.fps, progress=progress))
+    if command.json:
+        told = {} if picked is None else {"picked": picked.told}
+        print_json(report(clip) | told | {"files": written})
+        return 0
     for table in closing_table(clip):
         console.print(table)
     for note in clip.notes:

@@ -30,7 +30,7 @@ from ..simulation.blender import simulate_blender
 from ..simulation.newton import simulate_newton
 from ..viewer import check_preview, render_preview
 from ._commands import Effects, Simulate
-from ._progress import progress_bars
+from ._progress import print_json, progress_bars
 
 
 def simulate(command: Simulate, console: Console) -> int:
@@ -68,7 +68,7 @@ def simulate(command: Simulate, console: Console) -> int:
     out = command.out or command.preview
     keep = None if out is None else out.with_name(f".{out.name}.unfinished")
     began = time.perf_counter()
-    with progress_bars(console) as bars:
+    with progress_bars(Console(quiet=True) if command.json else console) as bars:
 
         def progress(done: int, total: int) -> None:
             bars("simulation", done, total)
@@ -92,10 +92,26 @@ def simulate(command: Simulate, console: Console) -> int:
         written = [] if command.out is None else write_clip(command.out, meshes, rollout.fps)
         if command.preview is not None:
             written.append(render_preview(command.preview, meshes, rollout.fps, progress=bars))
+    if command.json:
+        print_json(_report(rollout, scene.effects, took) | {"files": written})
+        return 0
     console.print(_summary(rollout, scene.effects, took))
     for path in written:
         console.print(f"wrote {path} (import at {rollout.fps:g} fps)", highlight=False)
     return 0
+
+
+def _report(rollout: Rollout, effects: tuple[Effect, ...], took: float) -> dict[str, object]:
+    frames = len(rollout.finite)
+    marked = {f.name: int(np.count_nonzero(rollout.status & int(f))) for f in Status}
+    return {
+        "frames": frames,
+        "fps": rollout.fps,
+        "seconds": took,
+        "effects": [type(e).__name__ for e in effects],
+        "worst": {k: float(np.max(v)) for k, v in rollout.diagnostics.items()},
+        "frames_marked": {k: n for k, n in marked.items() if n},
+    }
 
 
 def _is_scene(word: str) -> bool:

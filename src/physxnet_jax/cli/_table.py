@@ -1,5 +1,8 @@
 """The closing table of a dressed clip."""
 
+import dataclasses
+from typing import Any
+
 from rich.table import Table
 
 from ..dressing import DressedClip
@@ -37,6 +40,28 @@ def closing_table(clip: DressedClip) -> list[Table]:
             _share(clip.inside[m.name], 2),
         )
     return [times, fit]
+
+
+def report(clip: DressedClip) -> dict[str, Any]:
+    """The same for machines."""
+    return {
+        "frames": clip.num_frames,
+        "fps": clip.fps,
+        "method": clip.method,
+        "stages": [dataclasses.asdict(stage) for stage in clip.stages],
+        "garments": [
+            {
+                "name": m.name,
+                "vertices": m.positions.shape[1],
+                "hit_rate": clip.hit_rate[m.name],
+                "fallbacks": clip.fallbacks[m.name],
+                "inside_raw": clip.inside_raw[m.name],
+                "inside": clip.inside[m.name],
+            }
+            for m in clip.garments
+        ],
+        "notes": list(clip.notes),
+    }
 
 
 def _share(value: float | None, digits: int) -> str:

@@ -119,8 +119,8 @@ def _read_npz(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | Non
         x = data[key]
         if faces is None or x.ndim != 3 or x.shape[2] != 3 or not _numbers(x):
             raise FormatError(
-                f"{path}: '{key}' of shape {x.shape} with no '{prefix}faces' beside it or not"
-                " [frames, vertices, 3]."
+                f"{path}: '{key}' has the shape {x.shape}; it takes [frames, vertices, 3], and"
+                f" '{prefix}faces' beside it."
             )
         _check_faces(path, faces, x.shape[1])
         parts.append(Moving(prefix.rstrip("_") or "body", x, faces.astype(np.int32)))
