@@ -20,7 +20,8 @@ from physxnet_jax.motion import (
     read_gltf,
 )
 
-_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
+TESTS = pathlib.Path(__file__).parents[1]
+_SAMPLES = runpy.run_path(str(TESTS / "samples.py"))
 limbs_apart = _SAMPLES["limbs_apart"]
 
 
@@ -120,6 +121,23 @@ def test_a_walk_through_gltf_is_the_same_walk(body, rest, tmp_path, mode, suffix
     assert again.num_frames == walk.num_frames and again.fps == 30.0
     assert limbs_apart(body, rest, walk, again) < 0.2
     np.testing.assert_allclose(again.root, walk.root, atol=0.01)
+
+
+def test_a_trunk_without_a_direction_is_refused(tmp_path):
+    """Found by a fuzzer: a figure that lies, one hip above the other,
+    in line with the shoulders."""
+    document = json.loads(runpy.run_path(str(TESTS / "test_fuzz.py"))["_gltf"](tmp_path))
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(document))
+    load_motion(path)
+    places = {n["name"]: n for n in document["nodes"]}
+    for side, height in (("Left", 0.2), ("Right", -0.2)):
+        places[f"{side}UpLeg"]["translation"] = [0.0, height, 0.0]
+        places[f"{side}Leg"]["translation"] = [0.4, 0.0, 0.0]
+        places[f"{side}Arm"]["translation"] = [0.0, 2 * height + 0.5, 0.0]
+    path.write_text(json.dumps(document))
+    with pytest.raises(MotionError, match="one line"):
+        load_motion(path)
 
 
 def test_between_keys_linear_tracks_are_turned_evenly(body, rest, tmp_path):

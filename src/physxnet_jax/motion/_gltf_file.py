@@ -353,5 +353,11 @@ def _at(
 def _slerp(
     a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "n 4"], t: Float[np.ndarray, "n 1"]
 ) -> Float[np.ndarray, "n 4"]:
-    unit = lambda q: q / np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-9)  # noqa: E731
-    return slerp(unit(a), unit(b), t)
+    return slerp(_unit(a), _unit(b), t)
+
+
+def _unit(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
+    """Of length one; a key of zeros turns nothing."""
+    length = np.linalg.norm(q, axis=1, keepdims=True)
+    ok = (length > 1e-9) & np.isfinite(length)
+    return np.where(ok, q / np.where(ok, length, 1.0), (0.0, 0.0, 0.0, 1.0))

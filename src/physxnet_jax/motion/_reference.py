@@ -12,6 +12,8 @@ from ._skeletons import LIMBS
 from ._source import SourceClip
 
 _BOTH = ("Left", "Right")
+# Bones shorter or longer than this have no direction that can be computed with.
+_SHORTEST, _LONGEST = 1e-9, 1e9
 # At rest a skeleton stands if its legs and trunk lean less than 45 degrees.
 _STANDING = float(np.cos(np.radians(45.0)))
 # DAZ figures hold their forearms 17 degrees forward in their T-pose.
@@ -63,7 +65,7 @@ def reference_pose(
             return first, 1, np.eye(3)
     if not _stands(source, index, 1):
         frame = _straightest(source, index)
-        return source.rotations[frame], 0, _stance(source.positions()[frame], index)
+        return source.rotations[frame], 0, _stance(source, frame, index)
     # CMU's skeletons stand astride at rest: straighten each leg as one.
     pose = rest.copy()
     pointing = limb_directions(source, index, pose)
@@ -100,16 +102,29 @@ def _straightest(source: SourceClip, index: Mapping[str, int]) -> int:
     return int(np.argmax(upright))
 
 
-def _stance(
-    positions: Float[np.ndarray, "bones 3"], index: Mapping[str, int]
-) -> Float[np.ndarray, "3 3"]:
-    """Left, up and forward of the trunk, as columns."""
+def _stance(source: SourceClip, frame: int, index: Mapping[str, int]) -> Float[np.ndarray, "3 3"]:
+    """Left, up and forward of the trunk in a frame, as columns."""
+    positions = source.positions()[frame]
     left = positions[index["LeftUpLeg"]] - positions[index["RightUpLeg"]]
     up = _trunk(positions, index)
-    left, up = left / np.linalg.norm(left), up / np.linalg.norm(up)
+    size, high = np.linalg.norm(left), np.linalg.norm(up)
+    if not (_SHORTEST < size < _LONGEST and _SHORTEST < high < _LONGEST):
+        raise _no_trunk(source)
+    left, up = left / size, up / high
     left = left - (left @ up) * up
+    if np.linalg.norm(left) < 1e-6:
+        raise _no_trunk(source)
     left = left / np.linalg.norm(left)
     return np.stack([left, up, np.cross(left, up)], axis=1)
+
+
+def _no_trunk(source: SourceClip) -> MotionError:
+    return MotionError.at(
+        source.path,
+        None,
+        "hips and shoulders lie in one point or on one line, so nobody knows which way is up",
+        "Map other joints",
+    )
 
 
 def _trunk(
@@ -142,12 +157,12 @@ def limb_directions(
     for a, b in LIMBS.items():
         d = position[index[b]] - position[index[a]]
         length = float(np.linalg.norm(d))
-        if length < 1e-9:
+        if not _SHORTEST < length < _LONGEST:
             raise MotionError.at(
                 source.path,
                 None,
                 f"the bone from {source.names[index[a]]} to {source.names[index[b]]} has"
-                " length zero",
+                f" length {length:.3g}" + (": zero" if length < 1 else ""),
                 "Fix its OFFSET, or map other joints",
             )
         out[a] = d / length
