@@ -10,7 +10,7 @@ import pytest
 
 from physxnet_jax.cli import parse
 from physxnet_jax.data import DatasetConfig
-from physxnet_jax.dressing import load_scene
+from physxnet_jax.dressing import dress, load_scene
 from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
 from physxnet_jax.garment import FABRICS, TEMPLATES
 from physxnet_jax.io import list_weights, read_card
@@ -86,6 +86,17 @@ def test_costs_are_the_measured_ones():
     words = re.search(r"physxnet (bench net.*)", text).group(1).split()
     assert named == set(words[words.index("--weights") + 1 : words.index("--garments")])
     assert named <= set(list_weights())
+
+
+def test_round_trips_are_as_near_as_is_told():
+    """Written and read back here, with fewer frames; the table is the measured one."""
+    told = (ROOT / "experiments/results/round_trips.md").read_text()
+    assert told in (ROOT / "docs/garments.md").read_text()
+    made = runpy.run_path(str(ROOT / "experiments/round_trips.py"))
+    meshes = list(dress("walk", ["bottom"], method="lbs", frames=2).meshes)
+    for text in (told, made["table"](meshes)):
+        far = [float(x) for x in re.findall(r"\| (\d\.\de[-+]\d+) \|", text)]
+        assert len(far) == len(made["FORMATS"]) and max(far) < 1e-5
 
 
 def test_blender_saw_what_is_told():
