@@ -76,6 +76,7 @@ def main() -> None:
     for name in (
         "ablations",
         "unseen",
+        "mirrored_answer",
         "accuracy_cost",
         "peers",
         "engines",
