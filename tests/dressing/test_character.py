@@ -10,7 +10,8 @@ import pytest
 from physxnet_jax.body import linear_blend_skinning
 from physxnet_jax.cli import main
 from physxnet_jax.dressing import dress, make_character
-from physxnet_jax.errors import MeshError, PhysXNetError
+from physxnet_jax.dressing._character import _poses as character_poses
+from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import template
 from physxnet_jax.geometry import closest_points, make_mesh
 from physxnet_jax.io import AnimatedMesh
@@ -95,13 +96,23 @@ def test_cloth_goes_along_with_what_no_joint_moves(character):
     assert np.abs(out[-1, :, :2]).max() < 1e-6
 
 
-def test_what_a_character_brings_cannot_be_given(body, man, character):
+def test_what_a_character_brings_cannot_be_given(body, character):
     with pytest.raises(PhysXNetError, match="leave out body and shape"):
         dress(character, ["top"], shape=body.default_shape())
-    _, _, mesh, _ = man
-    squashed = dataclasses.replace(mesh, positions=mesh.positions * np.float32([1.0, 0.2, 1.0]))
-    with pytest.raises(MeshError, match="can't be laid"):
-        make_character(squashed, FPS)
+    with pytest.raises(PhysXNetError, match="leave out body and shape"):
+        dress(character, ["top"], body=body)
+
+
+def test_the_likeliest_pose_is_tried_first(man):
+    """The bind pose, frame 0, then the frame that takes most room; no frame twice."""
+    _, _, mesh, bind = man
+    wide = mesh.positions.copy()
+    wide[5] *= np.float32([2.0, 1.0, 1.0])
+    for given, expected in ((bind, [bind, wide[0], wide[5]]), (None, [wide[0], wide[5]])):
+        found = character_poses(wide, given)
+        assert len(found) == len(expected)
+        assert all(a is b or np.array_equal(a, b) for a, b in zip(found, expected))
+    assert len(character_poses(mesh.positions[:1], None)) == 1
 
 
 def test_the_command_dresses_a_file(man, tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pygltflib
@@ -217,6 +218,41 @@ def test_a_usd_skin_is_baked(tmp_path):
     found = read_character(tmp_path / "a.usda", fps=10.0)[0]
     expected = np.stack([POINTS, POINTS + [0.1, 0, 0]])
     np.testing.assert_allclose(found.positions, expected, atol=1e-5)
+
+
+def test_a_stage_reads_nothing_outside_its_folder(tmp_path, clip):
+    (tmp_path / "in").mkdir()
+    write_clip(tmp_path / "secret.usda", [AnimatedMesh("body", clip, FACES)], 30.0)
+    write_clip(tmp_path / "in/near.usda", [AnimatedMesh("body", clip, FACES)], 30.0)
+    for name, fine in (("../secret.usda", False), ("near.usda", True)):
+        path = tmp_path / "in/a.usda"
+        path.write_text(f'#usda 1.0\n(\n    subLayers = [@./{name}@]\n    upAxis = "Y"\n)\n')
+        if fine:
+            np.testing.assert_allclose(read_character(path)[0].positions[0], clip[0], atol=1e-5)
+        else:
+            with pytest.raises(FormatError, match="outside its folder"):
+                read_character(path)
+
+
+def test_a_small_file_does_not_take_much_memory(tmp_path):
+    """Hours of animation of a few vertices, and frames that nobody has."""
+    turn = Rotation.identity()
+    g = pygltflib.GLTF2().load_binary(str(skinned(tmp_path / "a.glb", turn=turn, scale=1.0)))
+    blob = bytearray(g.binary_blob())
+    view = g.bufferViews[g.accessors[g.animations[0].samplers[0].input].bufferView]
+    blob[view.byteOffset : view.byteOffset + 8] = np.array([0, 9e4], "<f4").tobytes()
+    g.set_binary_blob(bytes(blob))
+    g.save(str(tmp_path / "b.glb"))
+    (tmp_path / "c.usda").write_text(
+        "#usda 1.0\n(\n    startTimeCode = 0\n    endTimeCode = 900000\n)\n"
+    )
+    for name in ("b.glb", "c.usda"):
+        tracemalloc.start()
+        with pytest.raises(PhysXNetError, match=name):
+            read_character(tmp_path / name)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 100e6
 
 
 def test_broken_files_are_refused_in_a_sentence(clip, tmp_path):

@@ -22,7 +22,7 @@ from ..geometry import (
 )
 from ._body import NUM_BODY_VERTICES, Body, load_body
 from ._kinematics import blend_rotations, linear_blend_skinning
-from ._scan import Scan
+from ._scan import Scan, nearest_facing
 
 # Pairs of points that a step of the fit sees, each way.
 _PAIRS = 800
@@ -34,6 +34,12 @@ _ALL_STEPS = 2 * len(_TURNS) * _TRIES[0] + _KEPT * _TRIES[1] + _STEPS
 # freely, hands and toes hardly.
 _FREE, _STIFF, _LOCKED = 2e-5, 2e-4, 5e-3
 _SHAPE_COST, _SCALE_COST = 2e-5, 2e-3
+# Distance at which a pair counts a quarter [m]: at first, in the end, and from step to step.
+_WIDE, _NARROW, _NARROWING = 0.25, 0.02, 0.85
+# Largest change of a parameter in a step, and the range of shape parameters.
+_LONGEST_STEP, _SHAPES = 0.4, (-0.5, 1.3)
+# Share of the distance along normals in the last steps: surfaces may slide.
+_SLIDE = 0.7
 # Cost of differences along an edge, beside that of a vertex's distance, step by step: a
 # displacement spreads over about its square root in edges, which are about 1 cm long.
 _STIFFNESS = (60.0, 25.0, 10.0, 4.0, 2.0)
@@ -186,11 +192,11 @@ class _Fit:
         for k in range(steps):
             rows, points, normals, distance = self._pairs(p)
             # Far pairs are likely wrong: they count less and less.
-            scale = max(0.25 * 0.85**k, 0.02)
+            scale = max(_WIDE * _NARROWING**k, _NARROW)
             weight = 1.0 / (1.0 + (distance / scale) ** 2) ** 2
             left = float(np.minimum(distance, 0.3).mean())
             weight = np.where(np.isfinite(distance), weight, 0.0) / len(rows)
-            slide = 1.0 if last and k > steps // 2 else 0.0
+            slide = _SLIDE if last and k > steps // 2 else 0.0
             hessian, slope = _normal_equations(
                 self.body,
                 jnp.asarray(rows),
@@ -202,8 +208,9 @@ class _Fit:
             )
             hessian = np.asarray(hessian, np.float64) + np.diag(cost + 1e-7)
             slope = np.asarray(slope, np.float64) + cost * (p - goal)
-            p = p - np.clip(scipy.linalg.solve(hessian, slope, assume_a="pos"), -0.4, 0.4)
-            p[joints:-4] = np.clip(p[joints:-4], -0.5, 1.3)
+            step = scipy.linalg.solve(hessian, slope, assume_a="pos")
+            p = p - np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+            p[joints:-4] = np.clip(p[joints:-4], *_SHAPES)
             self.done += 1
             if self.progress is not None:
                 self.progress("fitting the body", self.done, _ALL_STEPS)
@@ -217,14 +224,9 @@ class _Fit:
         )
         row, there = self.target.nearest(x[self.ours], n[self.ours])
         points, normals = self.target.points[self.theirs], self.target.normals[self.theirs]
-        tree = KDTree(x)
-        distance, back = map(np.asarray, tree.query(points, k=12))
-        facing = np.einsum("nkc,nc->nk", n[back], normals) > 0.3
-        first = np.where(facing.any(axis=1), facing.argmax(axis=1), 0)
-        pick = np.arange(len(points))
-        distance = np.where(facing.any(axis=1), distance[pick, first], np.inf)
+        back, distance = nearest_facing(KDTree(x), n, points, normals)
         return (
-            np.concatenate([self.ours, back[pick, first]]),
+            np.concatenate([self.ours, back]),
             np.concatenate([self.target.points[row], points]),
             np.concatenate([self.target.normals[row], normals]),
             np.concatenate([there, distance]),
@@ -263,7 +265,7 @@ def _normal_equations(
     p: Array,
     slide: Array,
 ) -> tuple[Array, Array]:
-    """Of weighted distances to the points, mostly along normals once ``slide`` is 1."""
+    """Of weighted distances to points, of which a share ``slide`` along the normals."""
     # Shape and joints need few of the vertices: those of the pairs and the joint markers.
     used = jnp.concatenate([rows, body.joint_rows.reshape(-1)])
     count = rows.shape[0]
@@ -280,7 +282,7 @@ def _normal_equations(
         x = linear_blend_skinning(rest[:count], small.weights[:count], world, shift)
         gap = x - points
         along = jnp.sum(gap * normals, axis=1, keepdims=True) * normals
-        return root_weight[:, None] * ((1.0 - 0.7 * slide) * gap + 0.7 * slide * along)
+        return root_weight[:, None] * ((1.0 - slide) * gap + slide * along)
 
     a = jax.jacfwd(residual)(p).reshape(-1, p.size)
     exact = jax.lax.Precision.HIGHEST

@@ -50,12 +50,7 @@ class Scan:
         self, points: np.ndarray, normals: np.ndarray, neighbours: int = 12
     ) -> tuple[np.ndarray, np.ndarray]:
         """Row of the nearest sample that faces the same way, and its distance [m]."""
-        distance, row = map(np.asarray, self.tree.query(points, k=neighbours))
-        facing = np.einsum("nkc,nc->nk", self.normals[row], normals) > _FACING
-        first = np.where(facing.any(axis=1), facing.argmax(axis=1), 0)
-        pick = np.arange(len(points))
-        found = np.where(facing.any(axis=1), distance[pick, first], np.inf)
-        return row[pick, first], found
+        return nearest_facing(self.tree, self.normals, points, normals, neighbours)
 
     def feet(
         self, points: np.ndarray, normals: np.ndarray
@@ -72,3 +67,29 @@ class Scan:
         distance = np.sqrt(np.asarray(found.squared_distance))
         distance = np.where(facing.any(axis=1), distance, np.inf)
         return np.asarray(found.face), np.asarray(found.weights), distance
+
+
+def nearest_facing(
+    tree: KDTree,
+    tree_normals: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    neighbours: int = 12,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of the nearest rows of a tree the first that faces as a point does.
+
+    Args:
+        tree: Points that are searched [m].
+        tree_normals: Their unit normals.
+        points: Query points [m].
+        normals: Their unit normals.
+        neighbours: Rows that are looked at.
+
+    Returns:
+        The rows and their distances [m]; infinite where none faces the same way.
+    """
+    distance, row = map(np.asarray, tree.query(points, k=neighbours))
+    facing = np.einsum("nkc,nc->nk", tree_normals[row], normals) > _FACING
+    first = np.where(facing.any(axis=1), facing.argmax(axis=1), 0)
+    pick = np.arange(len(points))
+    return row[pick, first], np.where(facing.any(axis=1), distance[pick, first], np.inf)

@@ -105,15 +105,6 @@ def make_character(
 
     Raises:
         MeshError: No pose fits the body.
-
-    Example:
-        >>> from physxnet_jax.motion import body_animation, procedural_clip
-        >>> walk = procedural_clip("walk", fps=10.0)
-        >>> body = load_body()
-        >>> x = np.asarray(body_animation(body, walk))[:2]
-        >>> mesh = AnimatedMesh("me", x, np.asarray(body.rest_mesh().faces))
-        >>> make_character(mesh, 10.0).motion.num_frames
-        2
     """
     base = load_body()
     mesh = dataclasses.replace(mesh, name="body")

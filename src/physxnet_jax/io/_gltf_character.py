@@ -10,8 +10,10 @@ from ..motion import GltfFile
 from ._character import Moving
 
 _TRIANGLES = 4
-# Skinned vertices times frames and joints that are computed.
+# Coordinates that are computed at most.
 _MOST = 3e8
+# Matrices of nodes, frames times nodes: an hour at 30 a second of fifty.
+_MOST_NODES = 6e6
 
 
 def read_gltf_meshes(
@@ -46,6 +48,8 @@ def read_gltf_meshes(
 def _read(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, str | None]:
     file = GltfFile(path)
     times = file.frame_times(rate=fps)[0]
+    if len(times) * len(file.document.nodes) > _MOST_NODES:
+        raise FormatError(f"{path}: {len(times):,} frames of {len(file.document.nodes)} nodes.")
     world, still = file.world(times), file.world()[0]
     parts: list[Moving] = []
     for n, node in enumerate(file.document.nodes):
@@ -61,7 +65,7 @@ def _read(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, s
             if node.skin is not None:
                 part = _skinned(file, node.skin, primitive, part, world, still)
             else:
-                part = _moved(part, world[:, n])
+                part = _moved(file, part, world[:, n])
             parts.append(part)
     moving = [p for p in parts if p.bind is not None] or parts
     return [_welded(p) for p in moving], float(fps), "Y"
@@ -87,6 +91,7 @@ def _primitive(
     positions = x[None]
     targets = primitive.targets or ()  # pyright: ignore[reportAttributeAccessIssue]
     if weights is not None and len(targets):
+        _check_size(file, max(len(weights), len(targets)), len(x))
         offsets = np.zeros((len(targets), *x.shape), np.float32)
         for k, target in enumerate(targets):
             which = target["POSITION"] if isinstance(target, dict) else target.POSITION
@@ -103,8 +108,14 @@ def _primitive(
     return Moving(name, positions, faces, uv, None if uv is None else faces)
 
 
-def _moved(part: Moving, world: Float[np.ndarray, "frames 4 4"]) -> Moving:
+def _check_size(file: GltfFile, frames: int, vertices: int) -> None:
+    if frames * vertices * 3.0 > _MOST:
+        raise FormatError(f"{file.path}: {frames} frames of {vertices:,} vertices. Cut the clip.")
+
+
+def _moved(file: GltfFile, part: Moving, world: Float[np.ndarray, "frames 4 4"]) -> Moving:
     """A mesh moved as a whole by its node."""
+    _check_size(file, len(world), part.positions.shape[1])
     x = np.broadcast_to(part.positions, (len(world), *part.positions.shape[1:]))
     turned = np.einsum("fab,fvb->fva", world[:, :3, :3], x) + world[:, None, :3, 3]
     return Moving(part.name, turned.astype(np.float32), part.faces, part.uv, part.uv_faces)
@@ -128,8 +139,7 @@ def _skinned(
         binds = told.reshape(-1, 4, 4).swapaxes(1, 2)
     weights = _joint_weights(file, primitive, part, len(joints))
     frames, vertices = len(world), part.positions.shape[1]
-    if frames * vertices * 12.0 > _MOST:
-        raise FormatError(f"{file.path}: {frames} frames of {vertices:,} vertices. Cut the clip.")
+    _check_size(file, frames, vertices)
     matrices = world[:, joints] @ binds
     out = np.zeros((frames, vertices, 3), np.float32)
     x = np.broadcast_to(part.positions, (frames, vertices, 3))

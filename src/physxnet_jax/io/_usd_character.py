@@ -8,7 +8,8 @@ import numpy as np
 from ..errors import FormatError, MissingDependencyError
 from ._character import Moving
 
-_MOST = 3e8
+# Coordinates and frames that are read at most.
+_MOST, _FRAMES = 3e8, 20_000
 
 
 def read_usd_meshes(
@@ -46,9 +47,16 @@ def _read(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
     from pxr import Usd, UsdGeom, UsdSkel
 
     stage = Usd.Stage.Open(str(path))
+    folder = path.parent.resolve()
+    for layer in stage.GetUsedLayers():
+        if layer.realPath and not pathlib.Path(layer.realPath).resolve().is_relative_to(folder):
+            raise FormatError(
+                f"{path}: it refers to '{layer.identifier[:80]}' outside its folder. Put that"
+                " beside it, or flatten the stage."
+            )
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     rate = stage.GetTimeCodesPerSecond() or 24.0
-    if not (np.isfinite([start, end, rate]).all() and 0 <= end - start < 1e6 and rate > 0):
+    if not (np.isfinite([start, end, rate]).all() and 0 <= end - start < _FRAMES and rate > 0):
         raise FormatError(f"{path}: runs from {start} to {end} at {rate} a second.")
     if stage.HasAuthoredTimeCodeRange():
         UsdSkel.BakeSkinning(Usd.PrimRange(stage.GetPseudoRoot()))
