@@ -19,6 +19,7 @@ CHARACTER_FORMATS = (".glb", ".gltf", ".usdc", ".usd", ".usda", ".pc2", ".mdd", 
 
 # Coordinates of a clip that are read at most.
 _MOST = 3e8
+_FARTHEST = 1e18
 # Heights of a person [m], grown or a child, in units that programs write.
 _HEIGHTS = (0.8, 2.6)
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254}
@@ -95,11 +96,15 @@ def read_character(
         read = _read_npz
     else:
         read = _read_cache
-    parts, rate, up = read(path, fps)
+    # What a damaged file holds may be infinite; it is refused below.
+    with np.errstate(all="ignore"):
+        parts, rate, up = read(path, fps)
     whole = _joined(_picked(path, parts, mesh))
     if whole.positions.size > _MOST:
         raise FormatError(f"{path}: {whole.positions.size:,} coordinates. Cut the clip.")
-    if not np.isfinite(whole.positions).all():
+    # Beyond that their squares aren't finite in float32.
+    binds = np.zeros(1) if whole.bind is None else whole.bind
+    if not all((np.abs(x) < _FARTHEST).all() for x in (whole.positions, binds)):
         raise FormatError(f"{path}: positions that aren't finite. Export it again.")
     rate = source_fps or rate or 30.0
     return _in_metres(path, _at_rate(whole, float(rate), float(fps), frames), up)
