@@ -1,7 +1,7 @@
 """Clothes on people who aren't ours: against the same clothes on the person behind them.
 
 Command: python experiments/own_bodies.py
-Cost:    four minutes.
+Cost:    about ten minutes beside other work.
 Result:  experiments/results/own_bodies.md, shown in docs/own-body.md, and its picture.
          Three persons in other triangles than the body's, bound in a T, walk and punch;
          known to the program as meshes alone.

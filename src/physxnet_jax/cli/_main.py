@@ -194,8 +194,11 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     if command.preview is not None:
         check_preview(command.preview)
     shape = load_body().shape(**_parse_shape(command.shape)) if command.shape else None
-    if command.own_body and (shape is not None or command.joint_map is not None):
-        raise PhysXNetError("--own-body brings its shape along: leave out --shape and --joint-map.")
+    if command.own_body and (command.shape or command.joint_map or command.skeleton):
+        raise PhysXNetError(
+            "--own-body brings its shape along and needs no joints: leave out --shape,"
+            " --joint-map and --skeleton."
+        )
     if command.body_mesh is not None and not command.own_body:
         raise PhysXNetError("--body-mesh chooses a mesh for --own-body: add that.")
     if command.quiet or command.json:

@@ -157,9 +157,11 @@ class GltfFile:
             rate: Frames a second; that of its closest keys if omitted, and then morph
                 targets don't count.
         """
-        keys = [times for times, _, _ in self._tracks(animation).values() if len(times) > 1]
-        if rate is not None:
-            keys += [t for t, _, _ in self._morphs(animation).values() if len(t) > 1]
+        keys = [
+            times
+            for (_, kind), (times, _, _) in self._tracks(animation).items()
+            if len(times) > 1 and (kind in _LENGTHS or rate is not None)
+        ]
         if not keys:
             raise MotionError.at(
                 self.path, None, "no animation of nodes", "Export it with its animation"
@@ -181,7 +183,7 @@ class GltfFile:
         out = {}
         for channel in a.channels:
             kind = channel.target.path
-            if channel.target.node is None or kind not in _LENGTHS:
+            if channel.target.node is None or kind not in (*_LENGTHS, "weights"):
                 continue
             node = self.index(channel.target.node, document.nodes, "node")
             sampler = a.samplers[self.index(channel.sampler, a.samplers, "sampler")]
@@ -189,9 +191,13 @@ class GltfFile:
             values = np.asarray(self.accessor(sampler.output), float)
             mode = sampler.interpolation or "LINEAR"
             rows = 3 * len(times) if mode == "CUBICSPLINE" else len(times)
+            if kind == "weights" and values.ndim == 1 and rows and len(values) % rows == 0:
+                # As many for each key as there are morph targets.
+                values = values.reshape(rows, -1)
             if (
                 times.ndim != 1
-                or values.shape != (rows, _LENGTHS[kind])
+                or values.ndim != 2
+                or values.shape != (rows, _LENGTHS.get(kind, values.shape[1]))
                 or not (np.isfinite(times).all() and np.isfinite(values).all())
                 or (np.diff(times) < 0).any()
             ):
@@ -203,37 +209,11 @@ class GltfFile:
         self, node: int, times: Float[np.ndarray, " frames"], animation: int = 0
     ) -> Float[np.ndarray, "frames targets"] | None:
         """Weights of a node's morph targets over time; None where nothing moves them."""
-        track = self._morphs(animation).get(node)
+        track = self._tracks(animation).get((node, "weights"))
         if track is None:
             return None
         keys, values, mode = track
         return _at(keys, values, mode, times, "weights")
-
-    def _morphs(self, animation: int) -> dict[int, tuple[np.ndarray, np.ndarray, str]]:
-        document = self.document
-        if not document.animations:
-            return {}
-        a = document.animations[self.index(animation, document.animations, "animation")]
-        out = {}
-        for channel in a.channels:
-            if channel.target.node is None or channel.target.path != "weights":
-                continue
-            node = self.index(channel.target.node, document.nodes, "node")
-            sampler = a.samplers[self.index(channel.sampler, a.samplers, "sampler")]
-            times = np.asarray(self.accessor(sampler.input), float)
-            values = np.asarray(self.accessor(sampler.output), float)
-            mode = sampler.interpolation or "LINEAR"
-            rows = 3 * len(times) if mode == "CUBICSPLINE" else len(times)
-            if (
-                times.ndim != 1
-                or values.ndim != 1
-                or len(values) % rows
-                or not (np.isfinite(times).all() and np.isfinite(values).all())
-                or (np.diff(times) < 0).any()
-            ):
-                raise self.broken(f"the keys of node {node}, weights")
-            out[node] = (times, values.reshape(rows, -1), mode)
-        return out
 
     def _buffer(self, which: object) -> bytes:
         n = self.index(which, self.document.buffers, "buffer")
