@@ -15,35 +15,20 @@ import collections
 import pathlib
 import statistics
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
 from rich.progress import track
 
 from physxnet_jax.body import load_body
-from physxnet_jax.data import list_sequences, read_sequence
+from physxnet_jax.data import list_sequences, mirrored_offsets, read_sequence
 from physxnet_jax.evaluation import network, skinning, vertex_error
 from physxnet_jax.files import whole_file
-from physxnet_jax.garment import TEMPLATES, Template, template
-from physxnet_jax.geometry import closest_points, make_mesh
+from physxnet_jax.garment import TEMPLATES
 from physxnet_jax.io import load_predictor
 from physxnet_jax.motion import mirrored
 
 RESULT = pathlib.Path(__file__).parent / "results/mirrored_answer.md"
 ASKED = ("local", "small", "nano")
 TOGETHER = {"local and small": ("local", "small"), "all three": ASKED}
-FLIP = np.array([-1.0, 1.0, 1.0], np.float32)
-
-
-def other_side(
-    name: Template,
-) -> tuple[Int[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3"]]:
-    """For each vertex of a template, where its mirror image lies: corners and weights."""
-    vertices, faces = (
-        np.asarray(x) for x in (template(name).mesh.vertices, template(name).mesh.faces)
-    )
-    foot = closest_points(make_mesh(vertices, faces), jnp.asarray(vertices * FLIP))
-    return faces[np.asarray(foot.face)], np.asarray(foot.weights)
 
 
 def main() -> None:
@@ -52,7 +37,6 @@ def main() -> None:
     words = parser.parse_args()
     body, plain = load_body(), skinning()
     methods = {name: network(load_predictor(name)) for name in ASKED}
-    sides = {t: other_side(t) for t in TEMPLATES}
     errors: dict[tuple[str, str], list[float]] = collections.defaultdict(list)
     folders = list_sequences(words.data, "test")
     if not folders:
@@ -63,11 +47,9 @@ def main() -> None:
         for t in TEMPLATES:
             skinned, skinned_twin = (plain(m, t).positions for m in (told.motion, twin))
             answers = {"skinning": np.zeros_like(skinned)}
-            corners, weights = sides[t]
             for name, method in methods.items():
                 one = method(told.motion, t).positions - skinned
-                two = method(twin, t).positions - skinned_twin
-                two = np.einsum("vk,fvkc->fvc", weights, two[:, corners]) * FLIP
+                two = mirrored_offsets(t, method(twin, t).positions - skinned_twin)
                 answers[name] = one
                 answers[f"{name}, mirrored too"] = 0.5 * (one + two)
             for label, names in TOGETHER.items():

@@ -77,6 +77,7 @@ def main() -> None:
         "ablations",
         "unseen",
         "mirrored_answer",
+        "cloth_memory",
         "accuracy_cost",
         "peers",
         "engines",

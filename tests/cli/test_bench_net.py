@@ -10,7 +10,7 @@ from flax import nnx
 
 from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
-from physxnet_jax.cli._bench_net import points
+from physxnet_jax.cli._bench_net import floors, points
 from physxnet_jax.data import Sequence
 from physxnet_jax.dressing import Cost, mean_errors
 from physxnet_jax.evaluation import skinning
@@ -124,6 +124,9 @@ def test_panels_are_numbers_of_garments_and_lines_run_through_sizes():
     low = [dataclasses.replace(r, precision="bfloat16") for r in rows]
     assert points(low)[-1][1] == "network bfloat16, 32 frames"
     assert len(points(rows[:3])) == 3, "without networks every number is shown"
+    noisy = [*rows, *(row("simulator", s, 1, 3, 6.0) for s in ("draft", "noise"))]
+    assert [p[1] for p in points(noisy)].count("simulator") == 1, "noise is a floor, no point"
+    assert floors(noisy) == {"3 garments": 6.0} and floors(rows) == {}
 
 
 def test_what_is_missing_is_said(tmp_path, capsys):

@@ -13,7 +13,9 @@ from physxnet_jax.data import (
     DatasetConfig,
     build_dataset,
     dataset_digest,
+    left_out,
     list_sequences,
+    load_action,
     make_codec,
     read_protocol,
     read_sequence,
@@ -139,6 +141,20 @@ def test_actions_are_changed_as_the_configuration_says(data_dir):
     both = load(DatasetConfig(mirror=True, speed=2.0), last)
     assert both.num_frames == (plain.num_frames + 1) // 2
     np.testing.assert_allclose(both.root[0] * jnp.array([-1.0, 1.0, 1.0]), plain.root[0], atol=1e-5)
+
+
+def test_what_is_left_of_clips_overlaps_no_action(data_dir):
+    actions = read_protocol(data_dir / "mocap")
+    rest = left_out(data_dir / "mocap", actions)
+    assert {"exercise", "jumps kicks punches", "salsa"} <= {a.name for a in rest}
+    tested = {a.file for a in actions if a.split == "test"}
+    for a in rest:
+        assert a.file not in tested and 60 <= a.frames <= 400
+        (told,) = (b for b in actions if b.name == a.name)
+        assert a.split == told.split
+        end, told_end = a.start + a.frames / 30.0, told.start + told.frames / 30.0
+        assert end <= told.start + 1e-6 or a.start >= told_end - 1e-6
+        assert load_action(data_dir / "mocap", a).num_frames == a.frames
 
 
 def test_unknown_actions_are_named_before_anything_is_built(data_dir, tmp_path):

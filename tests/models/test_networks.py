@@ -1,5 +1,7 @@
 """Networks: the fast transposed convolution, shapes, features and their invariances."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,7 @@ from physxnet_jax.models import (
     ModelConfig,
     Normalisation,
     Predictor,
+    ask_mirrored,
     at_precision,
     clip_features,
     depth_to_space,
@@ -370,6 +373,37 @@ def test_fewer_bits_change_little_and_more_bits_next_to_nothing(worn):
         # Were it float32 in disguise, both would agree to the last bit.
         gap = np.abs(np.asarray(high) - np.asarray(want)).max()
     assert 0.0 < gap < 2e-5 * scale
+
+
+@pytest.mark.parametrize("inputs", [LOCAL, PAPER_FAR], ids=["local", "far"])
+def test_asked_for_the_mirrored_person_too_the_answer_is_mirrored(worn, inputs):
+    atlas, surface, _ = worn
+    plain = trained_like(surface, atlas, inputs)
+    both = ask_mirrored(plain)
+
+    def mirror(texels):
+        signs = np.where(np.arange(texels.shape[-1]) % 3, 1.0, -1.0).astype(np.float32)
+        return atlas.from_map(atlas.to_map(texels)[:, :, ::-1]) * signs[None, None]
+
+    x = jax.random.normal(jax.random.key(4), (2, surface.rest.shape[0], inputs.channels))
+    for t in ("top", "dress"):
+        one, two = (mirror(plain.from_features(y, (t,))[t]) for y in (mirror(x), x))
+        seen, twin = (both.from_features(y, (t,))[t] for y in (x, mirror(x)))
+        valid = np.asarray(surface.valid[t])
+        twins = np.asarray(mirror(surface.valid[t][None, :, None].astype(jnp.float32)))[0, :, 0]
+        shared = valid & (twins != 0)
+        assert shared.sum() > 0.9 * valid.sum() > 0
+        np.testing.assert_allclose(seen[:, shared], mirror(twin)[:, shared], atol=2e-6)
+        mean = 0.5 * (plain.from_features(x, (t,))[t] + one)
+        np.testing.assert_allclose(seen[:, shared], mean[:, shared], atol=2e-6)
+        # Where the mirror image isn't covered there is one answer alone.
+        alone = valid & ~shared
+        want = plain.from_features(x, (t,))[t]
+        np.testing.assert_allclose(seen[:, alone], want[:, alone], atol=2e-6)
+        assert float(jnp.abs(two - plain.from_features(mirror(x), (t,))[t]).max()) > 0.01
+    moved = dataclasses.replace(surface, rest=surface.rest + jnp.array([[0.05, 0.0, 0.0]]))
+    with pytest.raises(ValueError, match="mirror images"):
+        ask_mirrored(dataclasses.replace(plain, surface=moved))
 
 
 @pytest.mark.parametrize("inputs", [LOCAL, PAPER_FAR], ids=["local", "far"])

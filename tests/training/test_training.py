@@ -21,6 +21,7 @@ from physxnet_jax.training import (
     discriminator_loss,
     map_picture,
     masked_l1,
+    masked_l2,
     read_metrics,
     soft_labels,
     train,
@@ -71,13 +72,14 @@ def test_losses_in_closed_form():
     predicted = jnp.ones((2, 3, 3))
     target = jnp.zeros((2, 3, 3)).at[1].set(5.0)
     valid = jnp.array([True, True, False])
-    one = masked_l1(predicted, target, valid, jnp.array([1.0, 0.0]))
-    both = masked_l1(predicted, target, valid, jnp.array([1.0, 1.0]))
-    none = masked_l1(predicted, target, valid, jnp.zeros((2,)))
-    assert (float(one), float(both), float(none)) == (1.0, 2.5, 0.0)
-    # What the mask hides has no influence.
-    hidden = masked_l1(predicted.at[:, 2].set(99.0), target, valid, jnp.array([1.0, 0.0]))
-    assert float(hidden) == 1.0
+    for distance, mean in ((masked_l1, 2.5), (masked_l2, 8.5)):
+        one = distance(predicted, target, valid, jnp.array([1.0, 0.0]))
+        both = distance(predicted, target, valid, jnp.array([1.0, 1.0]))
+        none = distance(predicted, target, valid, jnp.zeros((2,)))
+        assert (float(one), float(both), float(none)) == (1.0, mean, 0.0)
+        # What the mask hides has no influence.
+        hidden = distance(predicted.at[:, 2].set(99.0), target, valid, jnp.array([1.0, 0.0]))
+        assert float(hidden) == 1.0
 
 
 def test_batches_are_permutations_that_the_step_alone_decides():
@@ -155,6 +157,7 @@ def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):
     config = dataclasses.replace(config, learning_rate=0.3, adversarial=False, max_skipped=10**6)
     train(config, data, tmp_path)
     log = read_metrics(tmp_path)
+    assert json.loads((tmp_path / "config.json").read_text())["data"] == "a 20"
     measured = [x["validation_mm"] for x in log if "validation_mm" in x]
     best = int(np.argmin(measured))
     assert len(measured) - 1 - best == 2, "two without a better one, then it stopped"
@@ -167,6 +170,21 @@ def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):
     with pytest.raises(FormatError, match="aren't among"):
         train(dataclasses.replace(config, validation=("c",)), data, tmp_path / "c", steps=1)
     assert list((tmp_path / "events").iterdir()), "TensorBoard can show it"
+
+
+def test_mirrored_actions_are_learned_from_too(tmp_path):
+    config = dataclasses.replace(
+        CONFIG, mirror=True, validation=("b",), adversarial=False, validate_every=100, epochs=1
+    )
+    config = dataclasses.replace(config, squared=True)
+    data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
+    seen = []
+    train(config, data, tmp_path, report=lambda done, total, _: seen.append((done, total)))
+    # Twice twenty frames, and nothing of what is kept for measuring.
+    assert json.loads((tmp_path / "config.json").read_text())["data"] == "a 20, a 20"
+    assert seen[-1] == (10, 10)
+    losses = [x["l2"] for x in read_metrics(tmp_path) if "loss" in x]
+    assert losses and all(0.0 < x < 1.0 for x in losses)
 
 
 def test_lines_of_steps_that_will_be_done_again_do_not_count(tmp_path):

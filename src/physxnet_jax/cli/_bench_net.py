@@ -80,7 +80,7 @@ def bench_net(command: Bench, console: Console) -> int:
     if command.out is not None:
         with whole_file(command.out.with_suffix(".md")) as part:
             part.write_text(text)
-        draw_work_precision(command.out.with_suffix(".png"), points(rows), {})
+        draw_work_precision(command.out.with_suffix(".png"), points(rows), floors(rows))
         console.print(f"wrote {command.out}, .md and .png", highlight=False)
     return 0
 
@@ -113,16 +113,28 @@ def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
     panels = {r.garments for r in rows if r.method.startswith("network")}
     out = []
     for r in rows:
-        if math.isnan(r.rmse_mm) or (panels and r.garments not in panels):
+        if math.isnan(r.rmse_mm) or (panels and r.garments not in panels) or _is_noise(r):
             continue
         name = r.method if r.precision == "float32" else f"{r.method} {r.precision}"
         # Another family is no rung of the same ladder.
         name = f"{name} (paper)" if r.size == "paper" else name
         if r.method.startswith("network"):
             name += ", live" if r.batch == 1 else f", {r.batch} frames"
-        panel = "one garment" if r.garments == 1 else f"{r.garments} garments"
-        out.append((panel, name, r.rmse_mm, r.ms_per_frame))
+        out.append((_panel(r), name, r.rmse_mm, r.ms_per_frame))
     return out
+
+
+def floors(rows: Sequence[Cost]) -> dict[str, float]:
+    """What two runs of the simulator that should be one differ by, for each panel."""
+    return {_panel(r): r.rmse_mm for r in rows if _is_noise(r) and not math.isnan(r.rmse_mm)}
+
+
+def _panel(row: Cost) -> str:
+    return "one garment" if row.garments == 1 else f"{row.garments} garments"
+
+
+def _is_noise(row: Cost) -> bool:
+    return (row.method, row.size) == ("simulator", "noise")
 
 
 def _to_json(row: Cost) -> dict[str, Any]:

@@ -45,6 +45,7 @@ def train(command: Train, console: Console) -> int:
             "actions": len(sequences),
             "frames": sum(s.motion.num_frames for s in sequences),
             "steps": int(log[-1]["step"]) if log else 0,
+            "mirrored too": config.mirror,
             "adversarial": config.adversarial,
             "seed": config.seed,
             "gan_alarms": int(alarms),

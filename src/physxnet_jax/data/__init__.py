@@ -3,9 +3,14 @@
 from ._build import build_dataset as build_dataset, skinned_cloth as skinned_cloth
 from ._codec import Codec as Codec, make_codec as make_codec
 from ._config import CARD as CARD, DatasetConfig as DatasetConfig
+from ._mirror import (
+    mirrored_offsets as mirrored_offsets,
+    mirrored_sequence as mirrored_sequence,
+)
 from ._protocol import (
     FPS as FPS,
     Action as Action,
+    left_out as left_out,
     load_action as load_action,
     read_protocol as read_protocol,
 )

@@ -16,7 +16,7 @@ from ..motion import Motion, animate, at_speed, exaggerated, mirrored, with_uppe
 from ..simulation import PreparedScene, Scene, prepare_scene, simulate_batch
 from ..simulation.blender import simulate_blender
 from ._config import CARD, DatasetConfig
-from ._protocol import FPS, Action, load_action, read_protocol
+from ._protocol import FPS, Action, left_out, load_action, read_protocol
 from ._store import (
     QUANTUM,
     is_stored,
@@ -66,6 +66,8 @@ def build_dataset(
             f" there are: {', '.join(a.name for a in actions)}."
         )
     actions = [a for a in actions if not only or a.name in only]
+    if config.left_out:
+        actions = left_out(folder, actions)
     open_dataset(root, _note(config))
     jobs = [(t, a) for t in config.templates for a in actions[shard[0] :: shard[1]]]
     done = 0
@@ -109,7 +111,7 @@ def _note(config: DatasetConfig) -> dict[str, Any]:
 
 def _changes(config: DatasetConfig) -> dict[str, Any]:
     """Settings that sets built before there were any don't name."""
-    changes = {"upper_from": config.upper_from, "exaggerate": config.exaggerate}
+    changes = {k: getattr(config, k) for k in ("left_out", "upper_from", "exaggerate")}
     usual = DatasetConfig()
     return {k: v for k, v in changes.items() if v != getattr(usual, k)}
 

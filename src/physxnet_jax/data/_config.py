@@ -23,6 +23,8 @@ class DatasetConfig:
         engine: ``physxnet`` (this package's simulator) or ``blender`` (the paper's).
         splits: Of the protocol: ``train``, ``test``, ``extra``.
         templates: Garments, each simulated by itself.
+        left_out: Not the actions themselves, but what the protocol leaves out of their
+            clips, see `left_out`.
         mirror: Left and right of every motion are exchanged.
         speed: Every motion is played this many times as fast.
         upper_from: Spine, arms and head are taken from the action this many places
@@ -35,6 +37,7 @@ class DatasetConfig:
     engine: Literal["physxnet", "blender"] = "physxnet"
     splits: tuple[str, ...] = ("train", "test")
     templates: tuple[Template, ...] = TEMPLATES
+    left_out: bool = False
     mirror: bool = False
     speed: float = 1.0
     upper_from: int = 0

@@ -11,6 +11,8 @@ from ..errors import MotionError
 from ..motion import Motion, load_motion, sample
 
 FPS = 30.0
+# Frames of what is left of a clip: two seconds at least, about as much as two actions at most.
+_SHORTEST, _LONGEST = 60, 400
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +71,38 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
             )
             for row in csv.DictReader(file)
         ]
+
+
+def left_out(folder: str | pathlib.Path, actions: list[Action]) -> list[Action]:
+    """The longest stretch of each action's clip that no action of the protocol uses.
+
+    Clips that a test action is cut from are left alone, and so is what is shorter than
+    two seconds; no stretch is longer than 400 frames.
+
+    Args:
+        folder: Where the motion files and ``ACTIONS.csv`` lie.
+        actions: Whose clips are asked for.
+
+    Returns:
+        Actions of the same names and splits, with other frames.
+    """
+    folder = pathlib.Path(folder)
+    everything = read_protocol(folder)
+    out = []
+    for action in actions:
+        same = [a for a in everything if a.file == action.file]
+        if any(a.split == "test" for a in same):
+            continue
+        clip = load_motion(folder / action.file, source_fps=action.fps)
+        spans = sorted((a.start, a.start + a.frames / FPS) for a in same)
+        # The first frame of many clips is a calibration pose.
+        begins = [3.0 / FPS, *(end for _, end in spans)]
+        ends = [*(begin for begin, _ in spans), (clip.num_frames - 1) / clip.fps]
+        begin, end = max(zip(begins, ends), key=lambda gap: gap[1] - gap[0])
+        frames = min(int((end - begin) * FPS), _LONGEST)
+        if frames >= _SHORTEST:
+            out.append(dataclasses.replace(action, start=begin, frames=frames))
+    return out
 
 
 def load_action(folder: str | pathlib.Path, action: Action) -> Motion:

@@ -29,8 +29,8 @@ class Rung:
     """A way to dress, with its error on the twelve test actions of the paper's protocol.
 
     Attributes:
-        name: ``lbs``, a name of weights, one with ``+push``, or an accuracy of the
-            simulator.
+        name: ``lbs``, a name of weights, one with ``+mirror``, ``+push`` or both, or an
+            accuracy of the simulator.
         rmse_mm: Root mean square distance of vertices from the simulation at its
             ``standard`` setting [mm], by template.
         inside: Share of vertices inside the body that have room outside, by template.

@@ -9,7 +9,7 @@ from jaxtyping import Array
 from ..body import load_body
 from ..evaluation import NOISE, Blockwise, Method, Simulator, network, skinning
 from ..garment import Template, template
-from ..io import load_predictor
+from ..io import MIRROR, load_predictor
 from ..models import Predictor, Wearable, dress_frames
 from ..simulation import ACCURACY
 from ._push_out import SkinPatch, each_frame, make_patch, push_out
@@ -39,7 +39,9 @@ def method_by_name(name: str) -> Method:
 
     Args:
         name: A network is called by its weights' name or folder, or a run's folder; with
-            ``+push`` behind it its vertices are pushed out of the body.
+            ``+mirror`` behind it is asked for the mirrored person too (see
+            `ask_mirrored`), with ``+push`` behind all its vertices are pushed out of the
+            body.
 
     Raises:
         WeightsError: There are no such weights.
@@ -54,10 +56,11 @@ def method_by_name(name: str) -> Method:
     return pushed_network(predictor) if name.endswith("+push") else network(predictor)
 
 
-def weights_folder(name: str) -> str | pathlib.Path:
+def weights_folder(name: str) -> str:
     """Where a run keeps its weights; any other name as it is."""
-    run = pathlib.Path(name) / "weights"
-    return run if run.is_dir() else name
+    run = pathlib.Path(name.removesuffix(MIRROR)) / "weights"
+    mirror = MIRROR if name.endswith(MIRROR) else ""
+    return f"{run}{mirror}" if run.is_dir() else name
 
 
 @functools.partial(jax.jit, static_argnames=("fps",))

@@ -16,6 +16,7 @@ from ._pc2 import read_pc2 as read_pc2, write_pc2 as write_pc2
 from ._usd import write_usd as write_usd
 from ._weights import (
     DEFAULT as DEFAULT,
+    MIRROR as MIRROR,
     list_weights as list_weights,
     load_predictor as load_predictor,
     read_card as read_card,

@@ -21,12 +21,15 @@ from ..models import (
     ModelConfig,
     Normalisation,
     Predictor,
+    ask_mirrored,
     make_generator,
     make_surface,
 )
 from ..uv import make_atlas
 
 DEFAULT = "local"
+MIRROR = "+mirror"
+"""Behind the name of weights: the network is asked for the mirrored person too."""
 _TENSORS, _CARD = "weights.safetensors", "card.json"
 
 
@@ -96,7 +99,8 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
     """A predictor by the name of packaged weights, or from a folder.
 
     Args:
-        weights: A name of `list_weights`, or a folder that `save_predictor` wrote.
+        weights: A name of `list_weights`, or a folder that `save_predictor` wrote. With
+            ``+mirror`` behind it, see `ask_mirrored`.
 
     Returns:
         The predictor, on the built-in body's default shape.
@@ -107,7 +111,7 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
     """
     folder = _folder(weights)
     try:
-        return _load(weights, folder)
+        predictor = _load(weights, folder)
     except WeightsError:
         raise
     # A damaged card may hold anything anywhere; safetensors has errors of its own.
@@ -116,6 +120,7 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
             f"{weights}: the card or the tensors are damaged ({type(error).__name__}:"
             f" {str(error)[:200]}). Reinstall or copy them again."
         ) from error
+    return ask_mirrored(predictor) if str(weights).endswith(MIRROR) else predictor
 
 
 def _model(card: dict[str, Any]) -> ModelConfig:
@@ -176,10 +181,11 @@ def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
 
 
 def _folder(weights: str | pathlib.Path) -> pathlib.Path:
-    path = pathlib.Path(weights)
+    name = str(weights).removesuffix(MIRROR)
+    path = pathlib.Path(name)
     if (path / _CARD).is_file():
         return path
-    root = importlib.resources.files(__name__.rpartition(".")[0]) / "weights" / str(weights)
+    root = importlib.resources.files(__name__.rpartition(".")[0]) / "weights" / name
     packaged = pathlib.Path(str(root))
     if not (packaged / _CARD).is_file():
         raise WeightsError(

@@ -22,6 +22,7 @@ from ._predictor import (
     Surface as Surface,
     Wearable as Wearable,
     apply_offsets as apply_offsets,
+    ask_mirrored as ask_mirrored,
     dress_frames as dress_frames,
     make_generator as make_generator,
     make_surface as make_surface,

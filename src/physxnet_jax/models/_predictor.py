@@ -24,6 +24,8 @@ _FARTHEST = 3.0
 # Texels are wider than the gaps between vertices; a skirt also samples maps of both legs,
 # whose edges don't meet. Offsets are averaged over about this distance along the cloth [m].
 _SMOOTH, _SMOOTH_SKIRT = 0.015, 0.03
+# Half a texel of the largest atlas is wider than this [m].
+_SAME_PLACE = 0.005
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +116,8 @@ class Predictor:
         state: Parameters and statistics of the network.
         graph: Structure of the network.
         config: What the network is.
+        mirrored: Whether the network is asked for the mirrored person too, see
+            `ask_mirrored`.
     """
 
     atlas: Atlas
@@ -122,6 +126,7 @@ class Predictor:
     state: nnx.State
     graph: nnx.GraphDef = dataclasses.field(metadata={"static": True})
     config: ModelConfig = dataclasses.field(metadata={"static": True})
+    mirrored: bool = dataclasses.field(default=False, metadata={"static": True})
 
     def __call__(
         self,
@@ -165,15 +170,67 @@ class Predictor:
         network.eval()
         # All parameters have one type: float32, or what `at_precision` made of it.
         dtype = jax.tree.leaves(self.state)[0].dtype
-        out = network(self.atlas.to_map(features).astype(dtype), tuple(templates))
+        maps = self.atlas.to_map(features).astype(dtype)
+        if self.mirrored:
+            maps = jnp.concatenate([maps, _mirror_maps(maps)])
+        out = network(maps, tuple(templates))
         return {
             t: jnp.where(
                 self.surface.valid[t][None, :, None],
-                self.atlas.from_map(m).astype(jnp.float32) * self.normalisation.offset[t],
+                self._answers(m, t).astype(jnp.float32) * self.normalisation.offset[t],
                 0.0,
             )
             for t, m in out.items()
         }
+
+    def _answers(
+        self, maps: Float[Array, "all height width 3"], template: str
+    ) -> Float[Array, "batch texels 3"]:
+        """What maps say of texels; the mean of both answers where there are two."""
+        if not self.mirrored:
+            return self.atlas.from_map(maps)
+        plain, twin = jnp.split(maps, 2)
+        plain, twin = (self.atlas.from_map(m) for m in (plain, _mirror_maps(twin)))
+        # Where the mirror image isn't covered there is one answer alone.
+        covered = self.surface.valid[template].astype(plain.dtype)[:, None]
+        share = 0.5 * self.atlas.from_map(self.atlas.to_map(covered)[:, ::-1])[None]
+        return plain + share * (twin - plain)
+
+
+def _mirror_maps(
+    maps: Float[Array, "batch height width channels"],
+) -> Float[Array, "batch height width channels"]:
+    """Maps of vectors as a mirror shows the person: the chart's halves mirror each other.
+
+    Holds for vectors in the world's axes and in those of a texel's own frame alike.
+    """
+    channels = maps.shape[-1]
+    signs = jnp.asarray(np.where(np.arange(channels) % 3 == 0, -1.0, 1.0), maps.dtype)
+    return maps[:, :, ::-1] * signs[None, None, None]
+
+
+def ask_mirrored(predictor: Predictor) -> Predictor:
+    """A predictor that asks its network for the mirrored person too, and averages.
+
+    Twice the network's work for each frame. What it answers to a mirrored motion is
+    exactly the mirrored answer.
+
+    Args:
+        predictor: A predictor on the built-in body's chart, whose halves are each other's
+            mirror image.
+
+    Raises:
+        ValueError: The halves of the atlas aren't.
+    """
+    atlas = predictor.atlas
+    places = np.asarray(atlas.to_map(predictor.surface.rest))
+    twins = places[:, ::-1] * np.array([-1.0, 1.0, 1.0])
+    mask = np.asarray(atlas.mask)
+    both = mask & mask[:, ::-1]
+    away = np.linalg.norm(places - twins, axis=-1)[both]
+    if both.sum() < 0.99 * mask.sum() or np.quantile(away, 0.99) > _SAME_PLACE:
+        raise ValueError("the halves of the atlas aren't mirror images; ask plainly.")
+    return dataclasses.replace(predictor, mirrored=True)
 
 
 def normalise(

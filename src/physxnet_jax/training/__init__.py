@@ -14,6 +14,7 @@ from ._losses import (
     adversarial_loss as adversarial_loss,
     discriminator_loss as discriminator_loss,
     masked_l1 as masked_l1,
+    masked_l2 as masked_l2,
     soft_labels as soft_labels,
 )
 from ._step import (

@@ -20,11 +20,15 @@ class TrainConfig:
         schedule: ``constant`` (the paper) or ``cosine`` (up over the first 2 % of the
             run, down to zero over the rest).
         l1_weight: lambda_L1 of equation 2.
+        squared: Errors are squared in place of the paper's absolute ones: where the same
+            motion has several outcomes the network then learns their mean, which is
+            what the root of mean squares asks for.
         vertex_share: Share of the L1 loss that is taken at the vertices of the templates,
             where maps are read, instead of at texels: maps then learn to make up for
             what reading them loses. 0 is the paper's; ``local`` only.
         adversarial: Whether there is a discriminator at all.
         discriminator_width: Channels of its first layer.
+        mirror: Every action is learned from as a mirror shows it, too.
         seed: Of everything random.
         precision: Of the network's arithmetic; parameters and losses stay float32.
         validation: Names of training actions that are kept from training and measured
@@ -43,9 +47,11 @@ class TrainConfig:
     momentum: float = 0.5
     schedule: Literal["constant", "cosine"] = "constant"
     l1_weight: float = 100.0
+    squared: bool = False
     vertex_share: float = 0.0
     adversarial: bool = True
     discriminator_width: int = 16
+    mirror: bool = False
     seed: int = 0
     precision: Literal["float32", "bfloat16"] = "float32"
     validation: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ import numpy as np
 from flax import nnx
 
 from ..body import load_body
-from ..data import Sequence
+from ..data import Sequence, mirrored_sequence
 from ..errors import FormatError, PhysXNetError
 from ..files import whole_file
 from ..garment import template
@@ -85,6 +85,8 @@ def train(
     garments = {t: template(t) for t in config.model.templates}  # pyright: ignore[reportArgumentType]
     held = _held_out(config, sequences)
     used = [s for s in sequences if s.name not in config.validation]
+    if config.mirror:
+        used += [mirrored_sequence(body, s) for s in used]
     frames = load_frames(used, garments, body, rest, config.model.inputs)
     unseen = load_frames(held, garments, body, rest, config.model.inputs) if held else None
     normalisation = _normalisation(config, frames, surface, tables)

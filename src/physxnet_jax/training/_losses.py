@@ -1,4 +1,4 @@
-"""The paper's losses: adversarial cross entropy with noisy labels, and L1 on texels."""
+"""The paper's losses: adversarial cross entropy with noisy labels, and L1 or L2 on texels."""
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +65,24 @@ def masked_l1(
     Returns:
         The mean; zero if nothing counts.
     """
+    return _masked_mean(jnp.abs(predicted - target), valid, sample_weight)
+
+
+def masked_l2(
+    predicted: Float[Array, "batch texels 3"],
+    target: Float[Array, "batch texels 3"],
+    valid: Bool[Array, " texels"],
+    sample_weight: Float[Array, " batch"],
+) -> Float[Array, ""]:
+    """Mean squared error, of the same as `masked_l1`."""
+    return _masked_mean(jnp.square(predicted - target), valid, sample_weight)
+
+
+def _masked_mean(
+    error: Float[Array, "batch texels 3"],
+    valid: Bool[Array, " texels"],
+    sample_weight: Float[Array, " batch"],
+) -> Float[Array, ""]:
     weight = valid.astype(jnp.float32)[None] * sample_weight[:, None]
-    error = jnp.sum(jnp.abs(predicted - target), axis=2) / 3.0
+    error = jnp.sum(error, axis=2) / 3.0
     return jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1.0)

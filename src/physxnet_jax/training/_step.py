@@ -25,7 +25,7 @@ from ..typing import pytree
 from ..uv import Atlas, Transference
 from ._batches import target_offsets
 from ._config import TrainConfig
-from ._losses import adversarial_loss, discriminator_loss, masked_l1, soft_labels
+from ._losses import adversarial_loss, discriminator_loss, masked_l1, masked_l2, soft_labels
 
 Batch = dict[str, Any]
 
@@ -197,13 +197,15 @@ def make_step(
             masks[t] = atlas.to_map(seen * weight)
         return x, targets, masks
 
-    def vertex_l1(texels: Array, target: Array, name: str, weight: Array, scale: Array) -> Array:
-        """Mean absolute error of offsets as `dress_frames` reads them, over their scale."""
+    distance = masked_l2 if config.squared else masked_l1
+
+    def at_vertices(texels: Array, target: Array, name: str, weight: Array, scale: Array) -> Array:
+        """Error of offsets as `dress_frames` reads them, over their scale."""
         wearable = tables[name].wearable
         seen = jnp.where(surface.valid[name][None, :, None], texels, 0.0)
         wanted = target.astype(jnp.float32) * QUANTUM / scale
         everywhere = jnp.ones((wanted.shape[1],), bool)
-        return masked_l1(wearable.sample(seen), wanted, everywhere, weight)
+        return distance(wearable.sample(seen), wanted, everywhere, weight)
 
     @jax.jit
     def look(
@@ -229,26 +231,26 @@ def make_step(
 
         def generator_loss(params: Any) -> tuple[Array, tuple]:
             maps, rest = generate(params, state.generator_rest, x)
-            l1 = jnp.zeros(())
+            total = jnp.zeros(())
             parts = {}
             for t in templates:
                 texels, weight = atlas.from_map(maps[t]), batch[f"weight_{t}"]
                 parts[t] = masked_l1(texels, targets[t], surface.valid[t], weight)
-                value = parts[t]
+                value = distance(texels, targets[t], surface.valid[t], weight)
                 if config.vertex_share:
-                    read = vertex_l1(
+                    read = at_vertices(
                         texels, batch[f"target_{t}"], t, weight, normalisation.offset[t]
                     )
                     value = (1.0 - config.vertex_share) * value + config.vertex_share * read
-                l1 = l1 + value / len(templates)
+                total = total + value / len(templates)
             fake = stack(maps, masks)
             adv = jnp.zeros(())
             if config.adversarial:
                 logits, _ = judge_maps(state.discriminator, state.discriminator_rest, x, fake)
                 adv = adversarial_loss(logits)
-            return adv + config.l1_weight * l1, (rest, fake, l1, adv, parts)
+            return adv + config.l1_weight * total, (rest, fake, total, adv, parts)
 
-        (loss, (g_rest, fake, l1, adv, parts)), grads = jax.value_and_grad(
+        (loss, (g_rest, fake, total, adv, parts)), grads = jax.value_and_grad(
             generator_loss, has_aux=True
         )(state.generator)
         updates, g_opt = _update(g_tx, grads, state.generator_opt, state.generator)
@@ -257,7 +259,8 @@ def make_step(
         g_rest = jax.tree.map(
             lambda new, old: jnp.where(ok, new, old), g_rest, state.generator_rest
         )
-        metrics = {"loss": loss, "l1": l1, "adversarial": adv}
+        kind = "l2" if config.squared else "l1"
+        metrics = {"loss": loss, kind: total, "adversarial": adv}
         metrics |= {f"l1_mm_{t}": 1e3 * parts[t] * normalisation.offset[t] for t in templates}
         metrics["skipped"] = g_opt.total_notfinite  # pyright: ignore[reportAttributeAccessIssue]
         d_params, d_rest, d_opt = (

@@ -6,6 +6,9 @@ from collections.abc import Mapping, Sequence
 from ..errors import MissingDependencyError
 from ..files import whole_file
 
+# Of methods beyond the tenth: colours come again.
+_MARKS = "osD^"
+
 
 def draw_work_precision(
     path: str | pathlib.Path,
@@ -32,7 +35,7 @@ def draw_work_precision(
             "Diagrams need matplotlib: pip install 'physxnet-jax[render]'."
         ) from error
     scenes = list(dict.fromkeys(p[0] for p in points))
-    figure = Figure(figsize=(4.6 * max(len(scenes), 1), 4.0), layout="constrained")
+    figure = Figure(figsize=(4.6 * max(len(scenes), 1), 4.6), layout="constrained")
     FigureCanvasAgg(figure)
     methods = list(dict.fromkeys(p[1] for p in points))
     for k, scene in enumerate(scenes):
@@ -42,18 +45,22 @@ def draw_work_precision(
             if not mine:
                 continue
             error, time = zip(*mine, strict=True)
-            colour = f"C{m}"
-            axes.plot(time, error, "-", color=colour, label=method)
+            # A method has one colour and mark in all panels.
+            colour = f"C{m % 10}"
+            mark = _MARKS[m // 10 % len(_MARKS)]
+            axes.plot(time, error, "-", marker=mark, color=colour, label=method)
             for e, t in zip(error, time, strict=True):
                 below = e < floors.get(scene, 0.0)
-                axes.plot([t], [e], "o", color=colour, mfc="white" if below else colour)
+                axes.plot([t], [e], mark, color=colour, mfc="white" if below else colour)
         if scene in floors:
             axes.axhline(floors[scene], color="grey", ls=":", lw=1, label="noise floor")
         axes.set(xscale="log", yscale="log", title=scene, xlabel="time [ms a frame]")
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylabel("error, rms [mm]")
         axes.grid(True, which="major", alpha=0.3)
-        axes.legend(fontsize=7)
+    drawn = [axes.get_legend_handles_labels() for axes in figure.axes]
+    legend = {name: handle for handles, names in drawn for handle, name in zip(handles, names)}
+    figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, fontsize=7)
     path = pathlib.Path(path)
     with whole_file(path) as part:
         figure.savefig(part, dpi=120, format="png")

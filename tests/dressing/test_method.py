@@ -1,0 +1,37 @@
+"""Methods by name: what the words behind a network's name do."""
+
+import numpy as np
+import pytest
+
+from physxnet_jax.body import load_body
+from physxnet_jax.data import mirrored_offsets
+from physxnet_jax.dressing import Rung, method_by_name
+from physxnet_jax.errors import WeightsError
+from physxnet_jax.io import load_predictor, read_card, weights_size
+from physxnet_jax.motion import Motion, load_motion, mirrored
+
+
+def test_a_name_with_mirror_answers_the_mirrored_person_with_the_mirrored_cloth():
+    walk = load_motion("punch", fps=30.0)
+    walk = Motion(walk.rotations[40:48], walk.root[40:48], walk.fps, walk.name)
+    twin = mirrored(load_body(), walk)
+    skinned = [method_by_name("lbs")(m, "top").positions for m in (walk, twin)]
+    away = {}
+    for name in ("nano", "nano+mirror"):
+        method = method_by_name(name)
+        one, two = (method(m, "top").positions - s for m, s in zip((walk, twin), skinned))
+        away[name] = np.linalg.norm(one - mirrored_offsets("top", two), axis=-1).mean()
+    # What is left is sampling: the meshes of both halves aren't the same.
+    assert away["nano+mirror"] < 0.3e-3 < 2e-3 < away["nano"]
+
+
+def test_the_card_is_that_of_the_weights():
+    assert read_card("nano+mirror") == read_card("nano")
+    assert weights_size("nano+mirror") == weights_size("nano")
+    assert load_predictor("nano+mirror").mirrored and not load_predictor("nano").mirrored
+    options = Rung("nano+mirror+push", {}, {}).options
+    assert options == {"method": "network", "weights": "nano+mirror", "resolve": True}
+    identities = {Rung(n, {}, {}).identity for n in ("nano", "nano+mirror", "nano+mirror+push")}
+    assert len(identities) == 3
+    with pytest.raises(WeightsError, match="No weights 'nana"):
+        load_predictor("nana+mirror")
