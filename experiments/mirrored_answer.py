@@ -5,9 +5,8 @@ Cost:    five minutes on two cores.
 Result:  experiments/results/mirrored_answer.md, shown in docs/reproduction.md: RMSE over
          vertices, means of the twelve test actions, and its share of skinning's.
 
-The mirrored motion's offsets, mirrored back onto the template (whose halves match to 0.02 mm),
-are averaged with the plain ones: twice the network's work for each garment. Offsets of several
-networks are averaged alike.
+`NAME+mirror` asks the network for the mirrored person too and averages both answers: twice the
+network's work. Offsets of several networks are averaged alike.
 """
 
 import argparse
@@ -18,13 +17,11 @@ import statistics
 import numpy as np
 from rich.progress import track
 
-from physxnet_jax.body import load_body
-from physxnet_jax.data import list_sequences, mirrored_offsets, read_sequence
+from physxnet_jax.data import list_sequences, read_sequence
 from physxnet_jax.evaluation import network, skinning, vertex_error
 from physxnet_jax.files import whole_file
 from physxnet_jax.garment import TEMPLATES
-from physxnet_jax.io import load_predictor
-from physxnet_jax.motion import mirrored
+from physxnet_jax.io import MIRROR, load_predictor
 
 RESULT = pathlib.Path(__file__).parent / "results/mirrored_answer.md"
 ASKED = ("local", "small", "nano")
@@ -35,27 +32,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", default="runs/ours")
     words = parser.parse_args()
-    body, plain = load_body(), skinning()
-    methods = {name: network(load_predictor(name)) for name in ASKED}
+    plain = skinning()
+    methods = {name: network(load_predictor(name)) for n in ASKED for name in (n, f"{n}{MIRROR}")}
     errors: dict[tuple[str, str], list[float]] = collections.defaultdict(list)
     folders = list_sequences(words.data, "test")
     if not folders:
         raise SystemExit(f"{words.data}: no test actions; build the dataset first.")
     for folder in track(folders, "actions"):
         told = read_sequence(folder)
-        twin = mirrored(body, told.motion)
         for t in TEMPLATES:
-            skinned, skinned_twin = (plain(m, t).positions for m in (told.motion, twin))
+            skinned = plain(told.motion, t).positions
             answers = {"skinning": np.zeros_like(skinned)}
             for name, method in methods.items():
-                one = method(told.motion, t).positions - skinned
-                two = mirrored_offsets(t, method(twin, t).positions - skinned_twin)
-                answers[name] = one
-                answers[f"{name}, mirrored too"] = 0.5 * (one + two)
+                answers[name] = method(told.motion, t).positions - skinned
             for label, names in TOGETHER.items():
-                for end in ("", ", mirrored too"):
+                for end in ("", MIRROR):
                     found = [answers[f"{n}{end}"] for n in names]
-                    answers[f"{label}{end}"] = sum(found) / len(found)
+                    answers[f"{label}{', mirrored too' if end else ''}"] = sum(found) / len(found)
             for name, offset in answers.items():
                 reference = skinned + told.offsets[t]
                 errors[name, t].append(vertex_error(skinned + offset, reference).rmse_mm)

@@ -34,12 +34,12 @@ METHODS = (
     "nearest",
     "mlp",
     "runs/local-22",
-    "nano",
-    "nano+push",
-    "small",
-    "small+push",
-    "local",
-    "local+push",
+    *(
+        f"{n}{m}{p}"
+        for n in ("nano", "small", "local")
+        for m in ("", "+mirror")
+        for p in ("", "+push")
+    ),
     "paper",
     "draft",
     "noise",
@@ -50,7 +50,9 @@ SETS = {
     "mirror": "mirrored training actions",
     "extra": "extra actions",
     "extra_mirror": "mirrored extra actions",
+    "left_out": "what the protocol leaves out of the clips of these",
     "mixed": "legs of training actions with upper bodies of others, wider",
+    "mixed_extra": "legs of extra actions with upper bodies of others, wider",
     "slow": "training actions at 0.8 of their speed",
     "blender": "protocol, Blender",
 }
@@ -83,6 +85,7 @@ def main() -> None:
         "engines",
         "training",
         "blender_import",
+        "layers",
     ):
         path = RESULTS / f"{name}.md"
         if path.is_file():
@@ -103,7 +106,7 @@ def main() -> None:
 def write_ladder(rows: list[ActionError]) -> None:
     """The errors by which `physxnet dress --budget-ms` chooses."""
     # The teacher itself is as far from itself as two of its runs part.
-    shipped = [f"{n}{push}" for n in ("nano", "small", "local") for push in ("", "+push")]
+    shipped = [m for m in METHODS if m.startswith(("nano", "small", "local"))]
     names = {n: n for n in ("lbs", *shipped, "draft")} | {"noise": "standard"}
     rungs = []
     for method, name in names.items():

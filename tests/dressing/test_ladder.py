@@ -92,10 +92,10 @@ def test_nothing_is_timed_twice_and_another_machine_is(tmp_path):
 def test_every_rung_of_the_package_can_be_dressed():
     ladder = load_ladder()
     names = {r.name for r in ladder}
-    assert {"lbs", "local", "local+push"} <= names
+    assert {"lbs", "local", "local+push", "local+mirror", "local+mirror+push"} <= names
     for r in ladder:
         assert set(r.rmse_mm) == set(r.inside) == set(TEMPLATES)
-        assert r.name.removesuffix("+push") in {"lbs", *list_weights(), *ACCURACY}
+        assert r.name.partition("+")[0] in {"lbs", *list_weights(), *ACCURACY}
         assert r.identity.startswith(r.name)
     plain = {r.name: r for r in ladder}
     clip = dress("walk", ["bottom"], frames=2, include_body=False, **plain["local"].options)

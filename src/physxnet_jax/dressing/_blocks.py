@@ -15,6 +15,7 @@ from ..garment import Garment
 from ..models import Predictor, Wearable, dress_frames, skin_wearable
 from ..motion import BLOCK, Motion, padded_block
 from ..simulation import ACCURACY, Scene, prepare_scene, simulate_batch, standard_effects
+from ._layers import Layer, inside_out, lift_layers
 from ._push_out import SkinPatch, each_frame, push_out, skin_height
 from ._stages import Stage
 
@@ -29,6 +30,7 @@ def dress_block(
     predictor: Predictor | None,
     wearables: tuple[Wearable, ...],
     patches: tuple[SkinPatch, ...],
+    layers: tuple[Layer, ...],
     rotations: Float[Array, "padded joints 3 3"],
     translations: Float[Array, "padded joints 3"],
     fps: float,
@@ -41,22 +43,25 @@ def dress_block(
         raw = tuple(jax.vmap(lambda a, b, w=w: skin_wearable(w, a, b))(r, t) for w in wearables)
     else:
         raw = dress_frames(predictor, wearables, rotations, translations, fps)
-    out = []
+    worn, inside = [], []
     for x, patch in zip(raw, patches, strict=True):
 
         def one(x: Array, r: Array, t: Array, q: SkinPatch = patch) -> tuple[Array, Array]:
             return push_out(q, x, r, t) if resolve else x, skin_height(q, x, r, t)[0]
 
         x, height = each_frame(one, x, r, t)
-        inside = jnp.mean((height < 0).astype(x.dtype), axis=1)
-        out.append((x, inside))
-    return tuple(out)
+        worn.append(x)
+        inside.append(jnp.mean((height < 0).astype(x.dtype), axis=1))
+    if resolve:
+        worn = lift_layers(layers, worn)
+    return tuple(zip(worn, inside, strict=True))
 
 
 def predict_clip(
     predictor: Predictor | None,
     wearables: Sequence[Wearable],
     patches: Sequence[SkinPatch],
+    layers: Sequence[Layer],
     world: np.ndarray,
     shift: np.ndarray,
     fps: float,
@@ -74,6 +79,7 @@ def predict_clip(
             predictor,
             tuple(wearables),
             tuple(patches),
+            tuple(layers),
             jnp.asarray(padded_block(world, start, lead)),
             jnp.asarray(padded_block(shift, start, lead)),
             fps,
@@ -119,11 +125,6 @@ def simulate_clip(
     warm = float(np.median(laps[1:])) / 10 if len(laps) > 1 else None
     stages.append(Stage("simulation", float(laps[0]), warm))
     return dict(zip([g.name for g in order], rollout.positions, strict=True))
-
-
-def inside_out(garments: Sequence[Garment]) -> list[Garment]:
-    """Garments in the order of layers: trousers, dresses, tops; else as they come."""
-    return sorted(garments, key=lambda g: ("bottom", "dress", "top").index(g.template))
 
 
 def inside_share(

@@ -26,6 +26,7 @@ from ..simulation import ACCURACY
 from ..uv import Binding, Transference, bind
 from ._blocks import inside_share, predict_clip, simulate_clip
 from ._character import Character, follow_leftover, inside_character, on_character
+from ._layers import make_layers
 from ._meshes import animated_meshes, with_names
 from ._push_out import make_patch, tuck_in
 from ._stages import Stage, Watch
@@ -93,7 +94,8 @@ def dress(
     Args:
         motion: A motion, a motion file, the name of a built-in clip, or a person of one's
             own (`load_character`), who brings body, shape and frame rate along.
-        wear: Garments, OBJ files or template names.
+        wear: Garments, OBJ files or template names. Tops go over dresses, dresses over
+            trousers; of two of one kind the first is beneath.
         method: ``network`` (packaged weights), ``lbs`` (skinning alone, the baseline)
             or ``simulate`` (the cloth simulator, the network's teacher).
         accuracy: Of ``simulate``: ``draft``, ``standard`` or ``fine``.
@@ -103,7 +105,8 @@ def dress(
         body: The body; the built-in one by default.
         shape: Shape parameters; the default shape if omitted.
         include_body: Put the body's mesh into the result.
-        resolve: Push vertices that end inside the body onto it (network and lbs).
+        resolve: Push vertices that end inside the body onto it, and garments off those
+            beneath them (network and lbs).
         progress: Called with a stage, frames done and frames in all.
 
     Returns:
@@ -170,11 +173,12 @@ def dress(
         [make_patch(body, rest, w, g.mesh) for w, g in zip(wearables, garments, strict=True)],
         wearables,
     )
+    layers = make_layers(body, rest, wearables, garments)
     if method == "simulate":
         positions = simulate_clip(garments, clip, body, shape, accuracy, stages, progress)
     else:
         positions = predict_clip(
-            predictor, wearables, patches, world, shift, clip.fps, resolve, stages, progress
+            predictor, wearables, patches, layers, world, shift, clip.fps, resolve, stages, progress
         )
     inside_raw: Any = positions.pop("inside_raw", None)
     inside = {

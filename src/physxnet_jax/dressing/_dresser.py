@@ -25,6 +25,7 @@ from ..models import (
 )
 from ..typing import pytree
 from ._dress import bound_wearable, fit_surface
+from ._layers import Layer, lift_layers, lift_off, make_layers
 from ._meshes import with_names
 from ._push_out import SkinPatch, each_frame, make_patch, push_out, tuck_in
 
@@ -42,6 +43,7 @@ class Dresser:
         predictor: The network, batch norm folded.
         wearables: What is worn.
         patches: The skin that each garment is pushed out of.
+        layers: Which garments lie over which, innermost first.
         faces: Triangles of each garment, shape [faces, 3].
         resolve: Whether it is.
     """
@@ -51,6 +53,7 @@ class Dresser:
     predictor: Predictor
     wearables: tuple[Wearable, ...]
     patches: tuple[SkinPatch, ...]
+    layers: tuple[Layer, ...]
     faces: tuple[Int[Array, "faces 3"], ...]
     resolve: bool = dataclasses.field(metadata={"static": True})
 
@@ -92,11 +95,13 @@ def make_dresser(
     """Loads weights and binds garments, once for all poses.
 
     Args:
-        wear: Garments, OBJ files or template names.
+        wear: Garments, OBJ files or template names. Tops go over dresses, dresses over
+            trousers; of two of one kind the first is beneath.
         weights: Name or folder of network weights, or a predictor.
         body: The body; the built-in one by default.
         shape: Shape parameters; the default shape if omitted.
-        resolve: Push vertices that end inside the body onto it.
+        resolve: Push vertices that end inside the body onto it, and garments off those
+            beneath them.
         precision: Of the network's arithmetic; all else stays float32.
 
     Raises:
@@ -115,7 +120,8 @@ def make_dresser(
         wearables,
     )
     faces = tuple(jnp.asarray(g.mesh.faces) for g in garments)
-    return Dresser(body, rest, predictor, wearables, patches, faces, resolve)
+    layers = make_layers(body, rest, wearables, garments)
+    return Dresser(body, rest, predictor, wearables, patches, layers, faces, resolve)
 
 
 def clothe(
@@ -154,12 +160,15 @@ def clothe(
     raw = dress_frames(
         dresser.predictor, dresser.wearables, pad_clip(world, inputs), pad_clip(shift, inputs), fps
     )
-    out = {}
-    for w, x, patch in zip(dresser.wearables, raw, dresser.patches, strict=True):
-        if dresser.resolve:
-            x = each_frame(functools.partial(push_out, patch), x, world, shift)
-        out[w.name] = x
-    return _clothed(out)
+    if dresser.resolve:
+        raw = lift_layers(
+            dresser.layers,
+            [
+                each_frame(functools.partial(push_out, patch), x, world, shift)
+                for x, patch in zip(raw, dresser.patches, strict=True)
+            ],
+        )
+    return _clothed({w.name: x for w, x in zip(dresser.wearables, raw, strict=True)})
 
 
 def start_clothing(
@@ -199,7 +208,9 @@ def clothe_frame(
     """
     world, shift = dresser.body.transforms(dresser.rest, rotations, root)
     stream, raw = stream_frame(dresser.predictor, dresser.wearables, stream, world, shift, fps)
-    out = {}
-    for w, x, patch in zip(dresser.wearables, raw, dresser.patches, strict=True):
-        out[w.name] = push_out(patch, x, world, shift) if dresser.resolve else x
-    return stream, _clothed(out)
+    worn = list(raw)
+    if dresser.resolve:
+        worn = [push_out(p, x, world, shift) for x, p in zip(raw, dresser.patches, strict=True)]
+        for layer in dresser.layers:
+            worn[layer.outer] = lift_off(layer, worn[layer.inner], worn[layer.outer])
+    return stream, _clothed({w.name: x for w, x in zip(dresser.wearables, worn, strict=True)})

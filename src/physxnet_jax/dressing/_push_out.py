@@ -104,14 +104,14 @@ def make_patch(
         body.weights[pick],
         jnp.asarray(corners.reshape(-1, 3).astype(np.int32)),
         jnp.asarray(local[: near.size].reshape(near.shape).astype(np.int32)),
-        jnp.asarray(_least_height(points, np.asarray(garment.faces))),
+        jnp.asarray(least_height(points, np.asarray(garment.faces))),
         jnp.full((len(points),), jnp.inf, jnp.float32),
         skirt,
         carry,
     )
 
 
-def _least_height(
+def least_height(
     points: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, " vertices"]:
     """Heights at which straight edges stay out of round limbs [m]."""

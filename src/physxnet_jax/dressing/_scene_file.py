@@ -14,7 +14,7 @@ from ..garment import FABRICS, Garment
 from ..io import load_garment
 from ..motion import Motion, load_motion
 from ..simulation import ACCURACY, EFFECTS, Effect, Scene, standard_effects
-from ._blocks import inside_out
+from ._layers import inside_out
 from ._meshes import with_names
 
 _KEYS: dict[str, type | tuple[type, ...]] = {

@@ -1,0 +1,110 @@
+"""A garment over another: outside it, in the order that is stated, and smoothly."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.body import load_body
+from physxnet_jax.dressing import clothe, clothe_frame, make_dresser, start_clothing
+from physxnet_jax.dressing._dress import unbound_wearable
+from physxnet_jax.dressing._layers import Layer, inside_out, layer_height, lift_off, make_layers
+from physxnet_jax.garment import grid_faces, template
+from physxnet_jax.geometry import Smoothing
+from physxnet_jax.motion import load_motion
+
+N = 9
+
+
+def sheets(height, tilt=0.0):
+    """Two squares of 40 cm, 5 cm meshes, the upper one ``height`` above the lower."""
+    x, z = np.meshgrid(np.linspace(0, 0.4, N), np.linspace(0, 0.4, N), indexing="ij")
+    low = np.stack([x, tilt * x, z], axis=-1).reshape(-1, 3).astype(np.float32)
+    faces = np.asarray(grid_faces(N, N))
+    up = np.cross(low[faces[0, 1]] - low[faces[0, 0]], low[faces[0, 2]] - low[faces[0, 0]])
+    faces = faces if up[1] > 0 else faces[:, ::-1]
+    rows = np.arange(N * N)
+    layer = Layer(
+        jnp.asarray(rows.astype(np.int32)),
+        jnp.asarray(np.ascontiguousarray(faces).astype(np.int32)),
+        jnp.asarray(np.tile(np.arange(len(faces)), (N * N, 1)).astype(np.int32)),
+        jnp.full((N * N,), 0.005, jnp.float32),
+        Smoothing(()),
+        0,
+        1,
+    )
+    return layer, jnp.asarray(low), jnp.asarray(low + np.float32([0.0, height, 0.0]))
+
+
+@pytest.mark.parametrize("height", [-0.02, 0.0, 0.003, 0.02])
+def test_a_flat_sheet_is_lifted_to_its_least_height(height):
+    layer, low, high = sheets(height)
+    # Without a neighbourhood the lift is taken whole at once.
+    seen = lift_off(layer, low, high)
+    np.testing.assert_allclose(seen[:, 1], max(height, 0.005), atol=1e-6)
+    np.testing.assert_allclose(seen[:, ::2], high[:, ::2], atol=1e-6)
+
+
+def test_what_lies_beside_or_far_behind_is_left_alone():
+    layer, low, high = sheets(0.0)
+    beside = high + jnp.array([[0.5, 0.0, 0.0]])
+    np.testing.assert_array_equal(lift_off(layer, low, beside)[N:], beside[N:])
+    behind = high - jnp.array([[0.0, 0.07, 0.0]])
+    np.testing.assert_array_equal(lift_off(layer, low, behind), behind)
+
+
+def test_turning_and_moving_both_changes_nothing():
+    layer, low, high = sheets(-0.004, tilt=0.3)
+    turn = jnp.asarray(np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0], jnp.float32)
+    turn = turn * jnp.sign(jnp.linalg.det(turn))
+    want = lift_off(layer, low, high) @ turn.T + 2.0
+    seen = lift_off(layer, low @ turn.T + 2.0, high @ turn.T + 2.0)
+    np.testing.assert_allclose(seen, want, atol=2e-6)
+
+
+@pytest.mark.parametrize("height", [-0.004, 0.0, 0.005])
+def test_gradients_are_finite_where_heights_meet(height):
+    """Exactly on the other garment, and exactly at the least height."""
+    layer, low, high = sheets(height)
+    grads = jax.grad(lambda a, b: jnp.sum(lift_off(layer, a, b) ** 2), argnums=(0, 1))(low, high)
+    assert all(bool(jnp.isfinite(g).all()) for g in grads)
+
+
+def test_the_order_is_trousers_dresses_tops_and_else_as_named():
+    body = load_body()
+    rest = body.rest_vertices(body.default_shape())
+    worn = [template(t) for t in ("top", "bottom", "top")]
+    worn[2] = dataclasses.replace(worn[2], name="jacket")
+    assert [g.name for g in inside_out(worn)] == ["bottom", "top", "jacket"]
+    wearables = [unbound_wearable(body, rest, g) for g in worn]
+    layers = make_layers(body, rest, wearables, worn)
+    # Trousers are pressed beneath tops and need no layer.
+    assert [(x.inner, x.outer) for x in layers] == [(0, 2)]
+    # A file whose faces are inside out is beneath from the same side.
+    turned = worn[0].mesh.replace(faces=worn[0].mesh.faces[:, ::-1])
+    other = [dataclasses.replace(worn[0], mesh=turned), *worn[1:]]
+    (again,) = make_layers(body, rest, wearables, other)
+    np.testing.assert_array_equal(again.faces, layers[0].faces)
+
+
+def test_of_two_alike_the_second_stays_over_the_first_live_and_in_clips():
+    """Two of the same trousers: by the network alone each vertex lies on its own twin."""
+    motion = load_motion("punch", fps=30.0)
+    q, p = motion.rotations[30:33], motion.root[30:33]
+    over = dataclasses.replace(template("bottom"), name="over")
+    dresser = make_dresser(["bottom", over], weights="nano")
+    whole = jax.jit(clothe, static_argnames="fps")(dresser, q, p, fps=30.0)
+    (layer,) = dresser.layers
+    for inner, outer in zip(whole["bottom"], whole["over"]):
+        assert np.abs(layer_height(layer, inner, inner)[0]).max() < 1e-5
+        height, beside, _ = layer_height(layer, inner, outer)
+        on = np.asarray(beside) < 0.005
+        assert on.mean() > 0.9 and np.quantile(height[on], 0.01) > 0.002
+    stream = start_clothing(dresser, q[0], p[0])
+    step = jax.jit(clothe_frame, static_argnames="fps")
+    for k in range(3):
+        stream, now = step(dresser, stream, q[k], p[k], fps=30.0)
+        away = np.abs(np.asarray(now["over"] - whole["over"][k]))
+        assert np.quantile(away, 0.999) < 2e-4
