@@ -85,7 +85,7 @@ def test_costs_are_the_measured_ones():
     named = {r["size"] for r in rows if r["method"].startswith("network")}
     words = re.search(r"physxnet (bench net.*)", text).group(1).split()
     assert named == set(words[words.index("--weights") + 1 : words.index("--garments")])
-    assert named <= set(list_weights())
+    assert {n.partition("+")[0] for n in named} <= set(list_weights())
 
 
 def test_round_trips_are_as_near_as_is_told():
@@ -107,6 +107,14 @@ def test_blender_saw_what_is_told():
     measured = (ROOT / "experiments/results/blender_import.md").read_text()
     assert block and block.group(1) == measured
     assert all(float(x) < 1e-5 for x in re.findall(r"\| (\d\.\de-\d+) \|", measured))
+
+
+def test_layers_are_told_as_measured():
+    measured = (ROOT / "experiments/results/layers.md").read_text()
+    assert measured in (ROOT / "docs/garments.md").read_text()
+    for row in measured.splitlines()[2:]:
+        outer, inner, kept_outer, kept_inner = (float(x) for x in row.split("|")[3:7])
+        assert kept_outer < 0.2 * outer and kept_inner < 0.2 * inner
 
 
 def test_broken_files_are_refused_as_is_told():

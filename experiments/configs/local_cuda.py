@@ -1,8 +1,8 @@
 """The `local` network at full size, for one CUDA machine.
 
-Command: physxnet train experiments/configs/local_cuda.py --name local --data runs/ours
-         --data runs/mirror --data runs/extra --data runs/extra_mirror
-         --splits train extra --out runs/local_cuda
+Command: physxnet train experiments/configs/local_cuda.py --name local
+         --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed
+         --data runs/mixed_extra --splits train extra --out runs/local_cuda
 Cost:    not measured yet, see experiments/gpu_queue.md.
 Result:  what more texels, channels and epochs are worth.
 """
@@ -18,6 +18,7 @@ CONFIG = TrainConfig(
     schedule="cosine",
     adversarial=False,
     vertex_share=0.7,
+    mirror=True,
     precision="bfloat16",
     validation=("kick ball",),
     validate_every=1000,

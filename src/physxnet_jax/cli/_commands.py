@@ -22,7 +22,8 @@ class Dress:
     motion: tyro.conf.Positional[str]
     """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
     wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and OBJ files."""
+    """Templates (top, bottom, dress) and OBJ files: tops over dresses over trousers, of two of one
+    kind the second over the first."""
     own_body: bool = False
     """The file is a person of your own to be dressed: .glb, .usd, .pc2, .mdd (with OBJ), .npz."""
     body_mesh: str | None = None
@@ -50,7 +51,7 @@ class Dress:
     joint_map: pathlib.Path | None = None
     """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
     weights: str = "local"
-    """Name or folder of network weights."""
+    """Name or folder of network weights; with +mirror the mirrored person is asked too."""
     shape: tuple[str, ...] = ()
     """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
     body: bool = True

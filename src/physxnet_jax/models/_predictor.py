@@ -18,8 +18,8 @@ from ._features import Family, Inputs, clip_features, skin_points
 from ._networks import Generator
 
 _EXACT = jax.lax.Precision.HIGHEST
-# Normalised lengths beyond this are no motion of a person's; of 0.1 % of texels in training
-# a component exceeds 1. Places are in metres.
+# Normalised lengths beyond this are no motion of a person's and no cloth of theirs; of 0.1 %
+# of texels in training a component exceeds 1. Places are in metres.
 _FARTHEST = 3.0
 # Texels are wider than the gaps between vertices; a skirt also samples maps of both legs,
 # whose edges don't meet. Offsets are averaged over about this distance along the cloth [m].
@@ -188,9 +188,9 @@ class Predictor:
     ) -> Float[Array, "batch texels 3"]:
         """What maps say of texels; the mean of both answers where there are two."""
         if not self.mirrored:
-            return self.atlas.from_map(maps)
+            return _shortened(self.atlas.from_map(maps))
         plain, twin = jnp.split(maps, 2)
-        plain, twin = (self.atlas.from_map(m) for m in (plain, _mirror_maps(twin)))
+        plain, twin = (_shortened(self.atlas.from_map(m)) for m in (plain, _mirror_maps(twin)))
         # Where the mirror image isn't covered there is one answer alone.
         covered = self.surface.valid[template].astype(plain.dtype)[:, None]
         share = 0.5 * self.atlas.from_map(self.atlas.to_map(covered)[:, ::-1])[None]

@@ -90,7 +90,7 @@ def draw_bars(
         ) from error
     panels = list(dict.fromkeys(b[0] for b in bars))
     methods = list(dict.fromkeys(b[2] for b in bars))
-    figure = Figure(figsize=(11.0, 3.2 * max(len(panels), 1)), layout="constrained")
+    figure = Figure(figsize=(12.5, 3.2 * max(len(panels), 1)), layout="constrained")
     FigureCanvasAgg(figure)
     for k, panel in enumerate(panels):
         axes = figure.add_subplot(len(panels), 1, k + 1)
@@ -109,7 +109,7 @@ def draw_bars(
         axes.set(title=panel, ylabel=label)
         axes.set_xticks(range(len(actions)), actions, rotation=20, ha="right", fontsize=8)
         axes.grid(True, axis="y", alpha=0.3)
-        axes.legend(fontsize=7, ncols=min(len(methods), 6))
+        axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     path = pathlib.Path(path)
     with whole_file(path) as part:
         figure.savefig(part, dpi=110, format="png")
