@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body
 from ..garment import Garment
-from ..geometry import Smoothing, gaussian_smoothing, safe_normalize, vertex_normals
+from ..geometry import Smoothing, gaussian_smoothing, vertex_normals
 from ..models import Wearable
 from ..typing import pytree
 from ._push_out import each_frame, least_height
@@ -159,7 +159,7 @@ def lift_layers(
 def layer_height(
     layer: Layer, beneath: Float[Array, "inner 3"], points: Float[Array, "outer 3"]
 ) -> tuple[Float[Array, " rows"], Float[Array, " rows"], Float[Array, "rows 3"]]:
-    """Heights above the inner garment, distances beside it [m], and its normals there."""
+    """Heights above the inner garment, distances beside it [m], and its unit normals there."""
     normals = vertex_normals(beneath, layer.faces)
     mine = points[layer.rows]
     foot, normal = skin_foot(beneath, normals, layer.faces, mine, layer.candidates)
@@ -177,4 +177,4 @@ def _way_up(
     height, beside, normal = layer_height(layer, beneath, points)
     fade = jnp.clip((height + _DEEPEST) / (0.25 * _DEEPEST), 0.0, 1.0)
     fade = fade * jnp.clip(1.0 - beside / _PAST_HEM, 0.0, 1.0)
-    return (fade * jnp.maximum(layer.least - height, 0.0))[:, None] * safe_normalize(normal)
+    return (fade * jnp.maximum(layer.least - height, 0.0))[:, None] * normal
