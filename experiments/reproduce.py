@@ -23,7 +23,7 @@ from physxnet_jax.data import dataset_digest, list_sequences, read_log, read_seq
 from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
 from physxnet_jax.files import whole_file
 from physxnet_jax.garment import TEMPLATES
-from physxnet_jax.training import usable_garment
+from physxnet_jax.training import teaches
 
 ROOT = pathlib.Path(__file__).parents[1]
 RESULTS = ROOT / "experiments/results"
@@ -53,6 +53,8 @@ SETS = {
     "left_out": "what the protocol leaves out of the clips of these",
     "mixed": "legs of training actions with upper bodies of others, wider",
     "mixed_extra": "legs of extra actions with upper bodies of others, wider",
+    "mixed_left_out": "the left out with upper bodies of others, wider",
+    "varied": "legs of all with upper bodies of others, slower and wider still",
     "slow": "training actions at 0.8 of their speed",
     "blender": "protocol, Blender",
 }
@@ -142,7 +144,7 @@ def note_datasets(folder: pathlib.Path) -> None:
             "actions": len(sequences),
             "frames": sum(s.motion.num_frames for s in sequences),
             "garments": sum(len(s.offsets) for s in sequences),
-            "came_off": sum(not usable_garment(s.meta[t]) for s in sequences for t in s.offsets),
+            "came_off": sum(not teaches(s, t) for s in sequences for t in s.offsets),
             "megabytes": round(size / 1e6, 1),
             "seconds": round(sum(x["seconds"] for x in log)) if log else None,
             "sha256": digest,

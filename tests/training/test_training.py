@@ -24,8 +24,10 @@ from physxnet_jax.training import (
     masked_l2,
     read_metrics,
     soft_labels,
+    teaches,
     train,
 )
+from physxnet_jax.training._batches import MAX_OFFSET
 from physxnet_jax.training._watch import Players, Validation
 
 CONFIG = TrainConfig(
@@ -123,6 +125,16 @@ def test_cloth_that_came_off_is_left_out(tmp_path):
         train(CONFIG, [sequence(ok=False)], tmp_path, steps=2)
     with pytest.raises(FormatError, match="build a dataset"):
         train(CONFIG, [], tmp_path, steps=2)
+
+
+def test_a_limb_out_of_its_sleeve_teaches_nothing_but_a_skirt_may_fly():
+    data = sequence()
+    far = {t: x + np.float32([0.0, MAX_OFFSET + 0.1, 0.0]) for t, x in data.offsets.items()}
+    skirt = {"dress": np.full((20, 9, 3), MAX_OFFSET, np.float32)}
+    flown = dataclasses.replace(data, offsets=far | skirt, meta=data.meta | {"dress": META})
+    told = {t: teaches(flown, t) for t in flown.offsets}
+    assert told == {"top": False, "bottom": False, "dress": True}
+    assert all(teaches(data, t) for t in data.offsets), "near ones do"
 
 
 def test_the_paper_family_trains_as_well(tmp_path):

@@ -5,6 +5,7 @@ from ._batches import (
     batch_indices as batch_indices,
     load_frames as load_frames,
     take as take,
+    teaches as teaches,
     usable_garment as usable_garment,
 )
 from ._checkpoint import Checkpoints as Checkpoints

@@ -28,6 +28,8 @@ from ..uv import Transference
 
 # A cloth this deep in the body has come off: such a sequence teaches nothing.
 MAX_PENETRATION = 0.1
+# Sleeves and trouser legs this far from their skinning have lost their limb [m]. Skirts may be.
+MAX_OFFSET = 0.5
 _CHUNK = 16
 
 
@@ -61,6 +63,14 @@ def usable_garment(meta: dict) -> bool:
     return bool(meta["finite"]) and meta["worst"]["penetration_max"] <= MAX_PENETRATION
 
 
+def teaches(sequence: Sequence, name: str) -> bool:
+    """Whether a simulated garment is one to learn from: it stayed on the body and its limbs."""
+    if name not in sequence.offsets or not usable_garment(sequence.meta[name]):
+        return False
+    far = np.linalg.norm(sequence.offsets[name], axis=2).max()
+    return name == "dress" or bool(far <= MAX_OFFSET)
+
+
 def load_frames(
     sequences: Items[Sequence],
     garments: dict[str, Garment],
@@ -90,7 +100,7 @@ def load_frames(
         rotations.append(np.asarray(pose_windows(world, inputs)))
         translations.append(np.asarray(pose_windows(shift, inputs)))
         for name, g in garments.items():
-            have = name in s.offsets and usable_garment(s.meta[name])
+            have = teaches(s, name)
             usable[name].append(np.full(len(world), have))
             if not have:
                 targets[name].append(np.zeros((len(world), g.num_vertices, 3), dtype=np.int16))
