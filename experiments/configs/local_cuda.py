@@ -2,7 +2,8 @@
 
 Command: physxnet train experiments/configs/local_cuda.py --name local
          --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed
-         --data runs/mixed_extra --splits train extra --out runs/local_cuda
+         --data runs/mixed_extra --data runs/mixed_left_out --data runs/varied
+         --splits train extra --out runs/local_cuda
 Cost:    not measured yet, see experiments/gpu_queue.md.
 Result:  what more texels, channels and epochs are worth.
 """

@@ -67,8 +67,8 @@ def teaches(sequence: Sequence, name: str) -> bool:
     """Whether a simulated garment is one to learn from: it stayed on the body and its limbs."""
     if name not in sequence.offsets or not usable_garment(sequence.meta[name]):
         return False
-    far = np.linalg.norm(sequence.offsets[name], axis=2).max()
-    return name == "dress" or bool(far <= MAX_OFFSET)
+    far = np.linalg.norm(sequence.offsets[name], axis=2) > MAX_OFFSET
+    return name == "dress" or not far.any()
 
 
 def load_frames(
