@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from physxnet_jax.errors import MotionError
 from physxnet_jax.motion import (
     CLIPS,
+    _procedural,
     body_animation,
     foot_heights,
     load_motion,
@@ -68,6 +69,32 @@ def test_built_in_clips_stand_on_the_floor_and_move_smoothly(name, body, rest):
     vertices = np.asarray(body_animation(body, clip))
     speed = np.linalg.norm(np.diff(vertices, axis=0), axis=2) * 30
     assert 0.3 < speed.max() < 12.0
+
+
+def hips(clip):
+    """Greatest acceleration of the hips along the floor and up [m/s^2]."""
+    root = np.asarray(clip.root, dtype=np.float64)
+    a = np.diff(root, 2, axis=0) * clip.fps**2
+    return np.linalg.norm(a[:, [0, 2]], axis=1).max(), np.abs(a[:, 1]).max()
+
+
+@pytest.mark.parametrize("name", [n for n in CLIPS if n != "jump"])
+@pytest.mark.parametrize("fps", [30.0, 60.0])
+def test_hips_glide_from_one_foot_to_the_other(name, fps):
+    along, up = hips(load_motion(name, fps=fps))
+    assert along < 8.0 and up < 13.0
+
+
+def test_hips_that_follow_the_standing_foot_at_once_are_jerked(monkeypatch):
+    monkeypatch.setattr(_procedural, "_GLIDE", 1e-3)
+    monkeypatch.setattr(_procedural, "_RISE", 1e-3)
+    along, up = hips(load_motion("walk", fps=30.0))
+    assert along > 20.0 and up > 15.0
+
+
+def test_a_walk_goes_forward_all_the_time():
+    ahead = np.diff(np.asarray(load_motion("walk", fps=30.0).root)[:, 2]) * 30.0
+    assert 0.4 < ahead.min() and ahead.max() < 1.6
 
 
 def test_round_trip_through_npz(tmp_path):

@@ -118,7 +118,8 @@ def test_a_walk_in_the_names_of_others_is_the_same_walk(body, rest, tmp_path, fa
     limbs, turns = degrees(body, rest, walk, again)
     # From a standing frame the turn of a limb about itself is known less well.
     assert limbs < 0.1 and turns < (5.0 if odd else 1.0)
-    np.testing.assert_allclose(again.root, walk.root, atol=0.01)
+    # Nor how far its feet were turned then, on which the clip is put down.
+    np.testing.assert_allclose(again.root, walk.root, atol=0.05 if odd else 0.01)
 
 
 def test_a_skeleton_that_stands_along_z_is_turned_upright(body, rest, tmp_path):

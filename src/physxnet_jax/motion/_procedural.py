@@ -10,15 +10,19 @@ from collections.abc import Callable, Mapping
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from ..body import Body, align_global, load_body
 from ..errors import MotionError
 from ._motion import Motion, animate, make_motion
-from ._retarget import foot_heights
+from ._retarget import foot_heights, stand_on_floor
 
 _X, _Y, _Z = np.eye(3)
 _TAU = 2 * np.pi
+# Widths over which steps along the floor and up and down are smoothed [s]: where the standing
+# foot changes, hips that followed it at once would be jerked at several g.
+_GLIDE, _RISE = 0.08, 0.03
 Time = Float[np.ndarray, " frames"]
 Turns = Mapping[str, Float[np.ndarray, "frames 3"]]
 
@@ -45,11 +49,15 @@ def _pair(left: np.ndarray, right: np.ndarray, joint: str) -> dict[str, np.ndarr
 def _walk(t: Time) -> tuple[Turns, Time]:
     phase = _TAU * t / 1.1
     stride, other = np.sin(phase), np.sin(phase + np.pi)
-    knee = [0.15 + 0.75 * np.maximum(np.cos(phase + k), 0.0) ** 2 for k in (0.0, np.pi)]
+    thigh = [0.38 * swing + 0.14 for swing in (stride, other)]
+    # Knees bend before their thigh comes forward: else the foot behind would still stand.
+    knee = [0.15 + 0.9 * np.maximum(np.cos(phase + k), 0.0) ** 2 for k in (0.5, 0.5 + np.pi)]
+    # Soles stay level as far as ankles turn.
+    foot = [0.3 * np.tanh((up - bent) / 0.3) for up, bent in zip(thigh, knee, strict=True)]
     turns = {
-        **_pair(_about(-_X, 0.42 * stride + 0.08), _about(-_X, 0.42 * other + 0.08), "UpLeg"),
+        **_pair(_about(-_X, thigh[0]), _about(-_X, thigh[1]), "UpLeg"),
         **_pair(_about(_X, knee[0]), _about(_X, knee[1]), "Leg"),
-        **_pair(_about(_X, 0.1 * stride), _about(_X, 0.1 * other), "Foot"),
+        **_pair(_about(_X, foot[0]), _about(_X, foot[1]), "Foot"),
         **_pair(_about(-_X, 0.45 * other), _about(-_X, 0.45 * stride), "Arm"),
         **_pair(_about(-_X, 0.35 + 0.2 * other), _about(-_X, 0.35 + 0.2 * stride), "ForeArm"),
         "Spine": _about(_Y, -0.08 * stride),
@@ -195,7 +203,8 @@ def procedural_clip(
 ) -> Motion:
     """A built-in clip on the body's skeleton.
 
-    The lower foot stands still on the floor, which moves the hips.
+    The lower foot stands still on the floor, which moves the hips; they glide from one
+    foot to the other.
 
     Args:
         name: One of ``CLIPS``.
@@ -213,7 +222,9 @@ def procedural_clip(
     if name not in CLIPS:
         raise MotionError(f"No built-in clip '{name}'; there are {', '.join(CLIPS)}.")
     body = load_body() if body is None else body
-    t = np.arange(round(seconds * fps)) / fps
+    frames = round(seconds * fps)
+    lead = int(np.ceil(4 * _GLIDE * fps))  # what smoothing reaches beyond both ends
+    t = np.arange(-lead, frames + lead) / fps
     turns, air = CLIPS[name](t)
     down = {"Left": np.array([0.14, -1.0, 0.02]), "Right": np.array([-0.14, -1.0, 0.02])}
     stance = {f"{s}{b}": d for s, d in down.items() for b in ("Arm", "ForeArm")}
@@ -226,13 +237,21 @@ def procedural_clip(
         up = aligned[parent].inv() if parent >= 0 else Rotation.identity()
         local[:, j] = (up * turn * aligned[j]).as_quat(scalar_first=True)
     motion = make_motion(local, np.zeros((len(t), 3)), fps, name=name)
-    return make_motion(local, _planted_root(body, motion, air, shape), fps, name=name)
+    root = _planted_root(body, motion, air, shape)[lead : lead + frames]
+    root[:, [0, 2]] -= root[0, [0, 2]]
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    return stand_on_floor(
+        body, make_motion(local[lead : lead + frames], root, fps, name=name), rest
+    )
 
 
 def _planted_root(
     body: Body, motion: Motion, air: Time, shape: Float[Array, " shapes"] | None
 ) -> Float[np.ndarray, "frames 3"]:
-    """Hips positions that keep the lower foot in place and the feet at height air."""
+    """Hips positions that keep the lower foot in place and the feet at height air.
+
+    Smooth but for the first and last 4 ``_GLIDE`` seconds.
+    """
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     ankles = [body.joint("LeftFoot"), body.joint("RightFoot")]
     heads = body.joint_positions(rest)[0][jnp.asarray(ankles)]
@@ -244,5 +263,7 @@ def _planted_root(
     step = share[1:, None] * np.diff(left, axis=0) + (1 - share[1:, None]) * np.diff(right, axis=0)
     root = np.zeros((len(left), 3))
     root[1:] = -np.cumsum(step, axis=0)
-    root[:, 1] = air - foot_heights(body, motion, rest)
+    root = gaussian_filter1d(root, _GLIDE * motion.fps, axis=0, mode="nearest", truncate=4.0)
+    feet_to_hips = -foot_heights(body, motion, rest)
+    root[:, 1] = air + gaussian_filter1d(feet_to_hips, _RISE * motion.fps, mode="nearest")
     return root
