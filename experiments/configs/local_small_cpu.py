@@ -1,13 +1,12 @@
 """The ladder's rung `small`: `local_cpu.py` with 16 channels in the first layer.
 
 Command: physxnet train experiments/configs/local_small_cpu.py --name small
-         --data runs/ours --data runs/mirror --data runs/extra --data runs/extra_mirror
-         --data runs/mixed --splits train extra --out runs/small
-Cost:    33 minutes on two cores beside other work: 9,005 steps.
-Result:  the rows `small` of experiments/results/test_errors.md.
-
-The recipe is that of `local_cpu.py`, the data a third of what it has learned from since; mirror
-images were simulated, which `TrainConfig.mirror` makes needless.
+         --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed
+         --data runs/mixed_extra --data runs/mixed_left_out --data runs/varied
+         --splits train extra --out runs/small
+Cost:    COST
+Result:  the rows `small` of experiments/results/test_errors.md: the recipe and the data of
+         `local_cpu.py`.
 """
 
 from physxnet_jax.models import Inputs, ModelConfig
@@ -15,14 +14,15 @@ from physxnet_jax.training import TrainConfig
 
 CONFIG = TrainConfig(
     model=ModelConfig(Inputs("local"), resolution=64, width=16),
-    epochs=5,
+    epochs=2,
     batch=8,
     learning_rate=3e-3,
     schedule="cosine",
     adversarial=False,
     vertex_share=0.7,
+    mirror=True,
     validation=("kick ball",),
-    validate_every=760,
+    validate_every=1000,
     patience=12,
-    checkpoint_every=760,
+    checkpoint_every=500,
 )

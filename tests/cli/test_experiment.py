@@ -11,7 +11,9 @@ from physxnet_jax.dressing import EXPORTED
 DATASET = """
 from physxnet_jax.data import DatasetConfig
 from physxnet_jax.simulation import XPBD
-CONFIG = DatasetConfig(splits=("train",), templates=("bottom",), solver=XPBD(8, 1))
+CONFIG = DatasetConfig(
+    splits=("train",), templates=("bottom",), exaggerate=1.1, solver=XPBD(8, 1)
+)
 """
 TRAIN = """
 from physxnet_jax.models import Inputs, ModelConfig
@@ -43,6 +45,8 @@ def test_build_train_evaluate(data_dir, tmp_path, capsys):
     card = json.loads((tmp_path / "run/weights/card.json").read_text())
     assert card["name"] == "tiny" and card["training"]["frames"] == 34
     assert "CMU" in card["licence"]
+    assert [(d["engine"], d["exaggerate"]) for d in card["data"]] == [("physxnet", 1.1)]
+    assert "upper_from" not in card["data"][0], "only what was changed is named"
     # Errors on what was learned from: only that the way is whole is asked here.
     measure = ["evaluate", "lbs", run, f"{run}+push", "--data", root, "--split", "train"]
     measure += ["--templates", "bottom", "--out", out]

@@ -92,6 +92,13 @@ def test_hips_that_follow_the_standing_foot_at_once_are_jerked(monkeypatch):
     assert along > 20.0 and up > 15.0
 
 
+@pytest.mark.parametrize("name", ["walk", "jump", "spin"])
+def test_built_in_clips_are_the_same_at_every_rate(name):
+    often, seldom = (load_motion(name, fps=rate) for rate in (30.0, 10.0))
+    np.testing.assert_allclose(often.root[::3], seldom.root, atol=2e-3)
+    np.testing.assert_allclose(often.rotations[::3], seldom.rotations, atol=1e-6)
+
+
 def test_a_walk_goes_forward_all_the_time():
     ahead = np.diff(np.asarray(load_motion("walk", fps=30.0).root)[:, 2]) * 30.0
     assert 0.4 < ahead.min() and ahead.max() < 1.6

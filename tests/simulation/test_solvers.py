@@ -115,6 +115,15 @@ def test_gradients_by_implicit_differentiation_agree_with_differences():
     assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02)
 
 
+def test_cloth_does_not_depend_on_how_many_frames_are_asked_for():
+    scene, draft = swinging(), XPBD(8, 2)
+    assert draft.at_rate(30.0) == draft and draft.at_rate(240.0) == XPBD(4, 1)
+    often = simulate_still(scene, 6, solver=draft).positions[0]
+    for solver, same in ((draft.at_rate(10.0), True), (draft, False)):
+        seldom = simulate_still(scene, 2, solver=solver, fps=10.0).positions[0]
+        assert (np.abs(seldom - often[2::3]).max() < 1e-5) == same
+
+
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_step_of_a_second_stays_finite(order):
     scene = swinging()

@@ -78,6 +78,7 @@ def simulate(command: Simulate, console: Console) -> int:
             rollout = run(scene, job.motion, progress=progress)
         else:
             solver = Implicit(16, 4) if command.engine == "bdf2" else ACCURACY[accuracy]
+            solver = solver.at_rate(job.motion.fps)
             rollout = simulate_batch(
                 prepare_scene(scene), [job.motion], solver=solver, progress=progress, resume=keep
             )[0]
@@ -161,7 +162,7 @@ def price(command: Effects, console: Console) -> int:
             job = SceneFile(job.scene, motion, job.accuracy)
     else:
         job = make_scene(command.scene, command.wear, frames=command.frames)
-    solver = ACCURACY[job.accuracy]
+    solver = ACCURACY[job.accuracy].at_rate(job.motion.fps)
     with progress_bars(console) as bars:
         rows = price_effects(
             job.scene, job.motion, solver=solver, progress=lambda d, t: bars("effects", d, t)

@@ -11,6 +11,9 @@ from ._configs import read_config
 from ._experiment_commands import Train
 from ._progress import progress_bars
 
+# What a card tells of each dataset.
+_NAMED = ("engine", "mirror", "speed", "left_out", "upper_from", "exaggerate", "fps", "quantum")
+
 
 def train(command: Train, console: Console) -> int:
     """Trains, or goes on; leaves the weights in the run's folder."""
@@ -37,9 +40,7 @@ def train(command: Train, console: Console) -> int:
     card = {
         **CARD,
         "data": [
-            {k: n[k] for k in ("engine", "mirror", "speed", "fps", "quantum") if k in n}
-            | {"splits": list(command.splits)}
-            for n in notes
+            {k: n[k] for k in _NAMED if k in n} | {"splits": list(command.splits)} for n in notes
         ],
         "training": {
             "actions": len(sequences),

@@ -118,7 +118,7 @@ def simulate_clip(
 
     order = inside_out(garments)
     scene = Scene(tuple(order), standard_effects(len(order)), body, shape)
-    solver = ACCURACY[accuracy]
+    solver = ACCURACY[accuracy].at_rate(clip.fps)
     rollout = simulate_batch(prepare_scene(scene), [clip], solver=solver, progress=tick)[0]
     rollout.check()
     laps = 1e3 * np.diff(ticks)

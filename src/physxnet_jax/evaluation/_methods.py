@@ -164,6 +164,7 @@ class Simulator:
             ticks.append(time.perf_counter())
             done.append(frames)
 
-        rollout = simulate_batch(self._scenes[name], [moved], solver=self._solver, progress=tick)[0]
+        solver = self._solver.at_rate(motion.fps)
+        rollout = simulate_batch(self._scenes[name], [moved], solver=solver, progress=tick)[0]
         laps = 1e3 * np.diff(ticks) / np.maximum(np.diff(done), 1)
         return Answer(rollout.positions[0], float(np.median(laps[1:] if len(laps) > 1 else laps)))

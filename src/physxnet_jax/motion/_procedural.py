@@ -23,6 +23,8 @@ _TAU = 2 * np.pi
 # Widths over which steps along the floor and up and down are smoothed [s]: where the standing
 # foot changes, hips that followed it at once would be jerked at several g.
 _GLIDE, _RISE = 0.08, 0.03
+# Steps are followed at least this often [1/s], so that clips are the same at every rate.
+_STEPPED = 120.0
 Time = Float[np.ndarray, " frames"]
 Turns = Mapping[str, Float[np.ndarray, "frames 3"]]
 
@@ -222,9 +224,11 @@ def procedural_clip(
     if name not in CLIPS:
         raise MotionError(f"No built-in clip '{name}'; there are {', '.join(CLIPS)}.")
     body = load_body() if body is None else body
-    frames = round(seconds * fps)
-    lead = int(np.ceil(4 * _GLIDE * fps))  # what smoothing reaches beyond both ends
-    t = np.arange(-lead, frames + lead) / fps
+    often = max(1, int(np.ceil(_STEPPED / fps)))
+    rate = often * fps
+    lead = int(np.ceil(4 * _GLIDE * rate))  # what smoothing reaches beyond both ends
+    kept = slice(lead, lead + often * round(seconds * fps), often)
+    t = np.arange(-lead, kept.stop + lead) / rate
     turns, air = CLIPS[name](t)
     down = {"Left": np.array([0.14, -1.0, 0.02]), "Right": np.array([-0.14, -1.0, 0.02])}
     stance = {f"{s}{b}": d for s, d in down.items() for b in ("Arm", "ForeArm")}
@@ -236,13 +240,11 @@ def procedural_clip(
         turn = Rotation.from_rotvec(turns.get(joint, np.zeros((len(t), 3))))
         up = aligned[parent].inv() if parent >= 0 else Rotation.identity()
         local[:, j] = (up * turn * aligned[j]).as_quat(scalar_first=True)
-    motion = make_motion(local, np.zeros((len(t), 3)), fps, name=name)
-    root = _planted_root(body, motion, air, shape)[lead : lead + frames]
+    motion = make_motion(local, np.zeros((len(t), 3)), rate, name=name)
+    root = _planted_root(body, motion, air, shape)[kept]
     root[:, [0, 2]] -= root[0, [0, 2]]
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
-    return stand_on_floor(
-        body, make_motion(local[lead : lead + frames], root, fps, name=name), rest
-    )
+    return stand_on_floor(body, make_motion(local[kept], root, fps, name=name), rest)
 
 
 def _planted_root(

@@ -63,7 +63,10 @@ ACCURACY: dict[str, Solver] = {
     "standard": XPBD(substeps=32, queries=4),
     "fine": XPBD(substeps=128, queries=8),
 }
-"""The one knob. Cost is proportional to the substeps, the error about inversely."""
+"""The one knob, for 30 frames a second; `Solver.at_rate` gives the same for others.
+
+Cost is proportional to the substeps, the error about inversely.
+"""
 
 
 def simulate(
@@ -102,7 +105,7 @@ def simulate(
     out = simulate_batch(
         prepare_scene(scene),
         [motion],
-        solver=ACCURACY[accuracy] if solver is None else solver,
+        solver=ACCURACY[accuracy].at_rate(motion.fps) if solver is None else solver,
         progress=progress,
         energies=energies,
         resume=resume,
@@ -141,7 +144,7 @@ def simulate_batch(
     """
     if not motions:
         raise SimulationError("No motion to simulate; give at least one.")
-    solver = ACCURACY["standard"] if solver is None else solver
+    solver = ACCURACY["standard"].at_rate(motions[0].fps) if solver is None else solver
     # Only around what is traced and run: the rest of the process keeps its precision.
     with jax.enable_x64(solver.precision == "float64"):
         return _roll(scene, motions, solver, progress, energies, resume)

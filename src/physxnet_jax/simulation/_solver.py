@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 # A residual of 1: another sweep would move the worst vertex by this much [m].
 TOLERANCE = 5e-4
+# Frames a second that substeps and queries are stated for.
+_RATE = 30.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +40,22 @@ class Solver(abc.ABC):
             )
         if self.precision not in ("float32", "float64"):
             raise ValueError(f"precision {self.precision!r} is neither float32 nor float64.")
+
+    def at_rate(self, fps: float) -> "Solver":
+        """These settings, meant for 30 frames a second, for motion of another rate.
+
+        Blocks and substeps keep their length; a frame has at least one block.
+
+        Args:
+            fps: Frames a second of the motion.
+
+        >>> from physxnet_jax.simulation import XPBD
+        >>> XPBD(substeps=32, queries=4).at_rate(10.0).substeps
+        96
+        """
+        each = self.substeps // self.queries
+        queries = max(1, round(self.queries * _RATE / fps))
+        return dataclasses.replace(self, substeps=each * queries, queries=queries)
 
     def prepare(self, scene: "PreparedScene") -> Any:
         """Tables the solver needs for a scene (a pytree), made once on the host."""

@@ -212,7 +212,7 @@ def _simulated(
     rollout = simulate_batch(
         prepare_scene(job.scene),
         [clip],
-        solver=ACCURACY[choice.accuracy],
+        solver=ACCURACY[choice.accuracy].at_rate(clip.fps),
         progress=None if progress is None else functools.partial(progress, "simulation"),
     )[0]
     rollout.check()
