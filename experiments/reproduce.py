@@ -49,7 +49,6 @@ SETS = {
     "ours": "protocol",
     "mirror": "mirrored training actions",
     "extra": "extra actions",
-    "extra_mirror": "mirrored extra actions",
     "left_out": "what the protocol leaves out of the clips of these",
     "mixed": "legs of training actions with upper bodies of others, wider",
     "mixed_extra": "legs of extra actions with upper bodies of others, wider",

@@ -12,7 +12,7 @@ from physxnet_jax.data import Sequence
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.evaluation import network, skinning
 from physxnet_jax.garment import template
-from physxnet_jax.models import PAPER, ModelConfig
+from physxnet_jax.models import PAPER, Inputs, ModelConfig
 from physxnet_jax.motion import load_motion
 from physxnet_jax.training import (
     TrainConfig,
@@ -27,7 +27,7 @@ from physxnet_jax.training import (
     teaches,
     train,
 )
-from physxnet_jax.training._batches import MAX_OFFSET
+from physxnet_jax.training._batches import MAX_OFFSET, load_frames
 from physxnet_jax.training._watch import Players, Validation
 
 CONFIG = TrainConfig(
@@ -135,6 +135,16 @@ def test_a_limb_out_of_its_sleeve_teaches_nothing_but_a_skirt_may_fly():
     told = {t: teaches(flown, t) for t in flown.offsets}
     assert told == {"top": False, "bottom": False, "dress": True}
     assert all(teaches(data, t) for t in data.offsets), "near ones do"
+
+
+def test_nothing_to_learn_from_and_mixed_rates_are_refused(body, rest):
+    usual = sequence()
+    slow = dataclasses.replace(usual, motion=dataclasses.replace(usual.motion, fps=15.0))
+    garments = {"bottom": template("bottom")}
+    for wrong, says in (((), "no sequence"), ((usual, slow), "different frame rates")):
+        with pytest.raises(FormatError, match=says):
+            load_frames(iter(wrong), garments, body, rest, Inputs())
+    assert len(load_frames(iter([usual]), garments, body, rest, Inputs())) == 20
 
 
 def test_the_paper_family_trains_as_well(tmp_path):

@@ -1,7 +1,7 @@
 """Training frames in memory, and batches that a step number alone decides."""
 
 import dataclasses
-from collections.abc import Sequence as Items
+from collections.abc import Iterable
 
 import jax
 import jax.numpy as jnp
@@ -72,13 +72,13 @@ def teaches(sequence: Sequence, name: str) -> bool:
 
 
 def load_frames(
-    sequences: Items[Sequence],
+    sequences: Iterable[Sequence],
     garments: dict[str, Garment],
     body: Body,
     rest: Float[Array, "all 3"],
     inputs: Inputs,
 ) -> Frames:
-    """Windows of poses and cloth targets of all sequences.
+    """Windows of poses and cloth targets of all sequences, each looked at once.
 
     Targets are cloth offsets in the family's frame: for ``local``, cloth minus its
     skinning, in each cloth vertex's own frame; for ``paper``, cloth positions relative
@@ -87,15 +87,15 @@ def load_frames(
     Raises:
         FormatError: Sequences of different rates, or none.
     """
-    if not sequences:
-        raise FormatError("no sequence to train on; build a dataset first.")
-    rates = {s.motion.fps for s in sequences}
-    if len(rates) != 1:
-        raise FormatError(f"sequences of different frame rates: {sorted(rates)}.")
-    rotations, translations = [], []
+    rotations, translations, told = [], [], []
+    rates: set[float] = set()
     targets: dict[str, list] = {t: [] for t in garments}
     usable: dict[str, list] = {t: [] for t in garments}
     for s in sequences:
+        rates.add(s.motion.fps)
+        if len(rates) != 1:
+            raise FormatError(f"sequences of different frame rates: {sorted(rates)}.")
+        told.append(f"{s.name} {s.motion.num_frames}")
         world, shift = clip_transforms(body, rest, s.motion)
         rotations.append(np.asarray(pose_windows(world, inputs)))
         translations.append(np.asarray(pose_windows(shift, inputs)))
@@ -109,14 +109,17 @@ def load_frames(
             if inputs.family == "local":
                 offset = _to_local(g, world, offset)
             targets[name].append(np.round(offset / QUANTUM).astype(np.int16))
+    if not told:
+        raise FormatError("no sequence to train on; build a dataset first.")
     cat = np.concatenate
     return Frames(
         cat(rotations),
         cat(translations),
-        {t: cat(v) for t, v in targets.items()},
+        # These are gigabytes: what is joined is let go of.
+        {t: cat(targets.pop(t)) for t in garments},
         {t: cat(v) for t, v in usable.items()},
         rates.pop(),
-        ", ".join(f"{s.name} {s.motion.num_frames}" for s in sequences),
+        ", ".join(told),
     )
 
 

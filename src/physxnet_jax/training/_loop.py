@@ -1,5 +1,6 @@
 """The training loop: resumable, logged, and ending in a predictor."""
 
+import itertools
 import json
 import pathlib
 import time
@@ -85,9 +86,9 @@ def train(
     garments = {t: template(t) for t in config.model.templates}  # pyright: ignore[reportArgumentType]
     held = _held_out(config, sequences)
     used = [s for s in sequences if s.name not in config.validation]
-    if config.mirror:
-        used += [mirrored_sequence(body, s) for s in used]
-    frames = load_frames(used, garments, body, rest, config.model.inputs)
+    # One at a time: each is as large as its original.
+    images = (mirrored_sequence(body, s) for s in used if config.mirror)
+    frames = load_frames(itertools.chain(used, images), garments, body, rest, config.model.inputs)
     unseen = load_frames(held, garments, body, rest, config.model.inputs) if held else None
     normalisation = _normalisation(config, frames, surface, tables)
     per_epoch = max(len(frames) // config.batch, 1)

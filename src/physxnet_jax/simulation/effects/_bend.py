@@ -8,11 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ...geometry import greedy_colours
 from ...typing import pytree
-from .._assembly import Assembly, float32
+from .._assembly import Assembly
 from .._effect import Clock, Effect, Prepared
-from ._coloured import corner_pairs, joined, scatter_rows
+from ._coloured import Sheaf, bundled, column, corner_pairs, sheaves, sweep
 from ._hinge import bending_hinges
 
 
@@ -30,28 +29,25 @@ class Bend(Effect):
     """
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Colours the hinges so that a Gauss-Seidel sweep runs group by group."""
+        """Colours the hinges so that a Gauss-Seidel sweep runs colour by colour."""
         h = bending_hinges(assembly)
         quads, coefficients, k = h.corners, h.coefficient, h.stiffness
         w = np.asarray(inverse_mass)
-        groups = []
-        for members in greedy_colours(quads, len(assembly.rest)):
-            index, c = quads[members], coefficients[members]
-            groups.append(
-                _Group(
-                    tuple(jnp.asarray(index[:, i]) for i in range(4)),
-                    tuple(float32(c[:, i][:, None, None]) for i in range(4)),
-                    tuple(float32((w[index[:, i]] * c[:, i])[:, None, None]) for i in range(4)),
-                    float32(((w[index] * c * c).sum(axis=1))[:, None, None]),
-                    float32((1.0 / np.maximum(k[members], 1e-12))[:, None, None]),
-                )
-            )
-        return _Bend(tuple(groups))
+        order, parts = sheaves(quads, len(assembly.rest))
+        index, c = quads[order].astype(np.int32), coefficients[order]
+        hinges = _Hinges(
+            tuple(jnp.asarray(index[:, i]) for i in range(4)),
+            tuple(column(c[:, i]) for i in range(4)),
+            tuple(column(w[index[:, i]] * c[:, i]) for i in range(4)),
+            column((w[index] * c * c).sum(axis=1)),
+            column(1.0 / np.maximum(k[order], 1e-12)),
+        )
+        return _Bend(hinges, parts)
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _Group:
+class _Hinges:
     index: tuple[Int[Array, " members"], ...]
     coefficient: tuple[Float[Array, "members 1 1"], ...]
     push: tuple[Float[Array, "members 1 1"], ...]
@@ -63,65 +59,56 @@ class _Group:
 @dataclasses.dataclass(frozen=True)
 class _Bend(Prepared):
     elastic = True
-    groups: tuple[_Group, ...]
+    hinges: _Hinges
+    sheaves: tuple[Sheaf, ...]
 
     def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
         if "bend" not in factors:
             return self
-        softer = [
-            dataclasses.replace(g, compliance=g.compliance / factors["bend"]) for g in self.groups
-        ]
-        return dataclasses.replace(self, groups=tuple(softer))
+        h = self.hinges
+        softer = dataclasses.replace(h, compliance=h.compliance / factors["bend"])
+        return dataclasses.replace(self, hinges=softer)
 
-    def begin(
-        self, base: Array, start: None, end: None, clock: Clock, memory: Any
-    ) -> tuple[Array, ...]:
+    def begin(self, base: Array, start: None, end: None, clock: Clock, memory: Any) -> tuple:
         # The coefficients sum to zero: differences keep the sum exact far from the origin.
-        out = []
-        for g in self.groups:
-            first = base[g.index[0]]
-            total = jnp.zeros_like(first)
-            for i in range(1, 4):
-                total = total + g.coefficient[i] * (base[g.index[i]] - first)
-            out.append(total)
-        return tuple(out)
+        h = self.hinges
+        first = base[h.index[0]]
+        flat = jnp.zeros_like(first)
+        for c, i in zip(h.coefficient[1:], h.index[1:], strict=True):
+            flat = flat + c * (base[i] - first)
+        known = (flat, h.coefficient, h.push, h.inertia, h.compliance)
+        return flat, bundled(self.sheaves, h.index, known)
 
     def project(
         self,
         displacement: Array,
         start: Array,
-        context: tuple[Array, ...],
+        context: tuple,
         progress: Array,
         step: tuple[float, float],
     ) -> Array:
         h = step[0]
-        d = displacement
-        for g, flat in zip(self.groups, context, strict=True):
-            rows = [d[i] for i in g.index]
-            curvature = flat
-            for c, row in zip(g.coefficient, rows, strict=True):
-                curvature = curvature + c * row
-            move = curvature / (g.inertia + g.compliance / (h * h))
-            rows = [row - p * move for p, row in zip(g.push, rows, strict=True)]
-            d = scatter_rows(d, list(g.index), rows)
-        return d
 
-    def energy(self, displacement: Array, context: tuple[Array, ...]) -> Array:
-        if not self.groups:
-            return jnp.zeros(displacement.shape[2:], displacement.dtype)
-        g, curvature = joined(self.groups), jnp.concatenate(context)
-        for c, i in zip(g.coefficient, g.index, strict=True):
+        def move(rows: list[Array], known: tuple) -> list[Array]:
+            curvature, coefficient, push, inertia, compliance = known
+            for c, row in zip(coefficient, rows, strict=True):
+                curvature = curvature + c * row
+            back = curvature / (inertia + compliance / (h * h))
+            return [row - p * back for p, row in zip(push, rows, strict=True)]
+
+        return sweep(displacement, context[1], move)
+
+    def energy(self, displacement: Array, context: tuple) -> Array:
+        h, curvature = self.hinges, context[0]
+        for c, i in zip(h.coefficient, h.index, strict=True):
             curvature = curvature + c * displacement[i]
-        return 0.5 * jnp.sum(curvature**2 / g.compliance, axis=(0, 1))
+        return 0.5 * jnp.sum(curvature**2 / h.compliance, axis=(0, 1))
 
     def coupled(self) -> Int[np.ndarray, "blocks 2"]:
-        none = np.zeros((0, 2), np.int64)
-        return corner_pairs(joined(self.groups).index) if self.groups else none
+        return corner_pairs(self.hinges.index)
 
     def constant_stiffness(self) -> Float[np.ndarray, " blocks"]:
-        if not self.groups:
-            return np.zeros(0)
-        g = joined(self.groups)
-        c = [np.asarray(x)[:, 0, 0] for x in g.coefficient]
-        k = 1.0 / np.asarray(g.compliance)[:, 0, 0]
+        h = self.hinges
+        c = [np.asarray(x)[:, 0, 0] for x in h.coefficient]
+        k = 1.0 / np.asarray(h.compliance)[:, 0, 0]
         return np.concatenate([k * a * b for a in c for b in c])

@@ -102,6 +102,7 @@ class BodyContact(Effect):
             jnp.asarray(local[faces[kept]]),
             jnp.asarray(tight.astype(np.int32)),
             jnp.asarray(loose.astype(np.int32)),
+            jnp.asarray(np.argsort(np.concatenate([tight, loose])).astype(np.int32)),
             jnp.asarray(local[start]),
             jnp.asarray(local[listed]),
             float32(assembly.thickness[:, None]),
@@ -213,6 +214,7 @@ class _Contact(Prepared):
     faces: Int[Array, "faces 3"]
     tight: Int[Array, " tight"]
     loose: Int[Array, " loose"]
+    order: Int[Array, " vertices"]
     start: Int[Array, " tight"]
     listed: Int[Array, "loose k"]
     thickness: Float[Array, "vertices 1"]
@@ -249,12 +251,14 @@ class _Contact(Prepared):
         """Over the surface to a skin vertex that has none nearer in its ring."""
         lane = jnp.arange(points.shape[2])[None, :, None]
         p = jnp.moveaxis(points, 1, 2)[:, :, None]
-        for _ in range(self.hops):
+
+        def hop(_: Array, at: Array) -> Array:
             ring = self.ring[at]
             gap = skin[ring, :, lane] - p
             best = jnp.argmin(jnp.sum(gap * gap, axis=3), axis=2)
-            at = jnp.take_along_axis(ring, best[..., None], axis=2)[..., 0]
-        return at
+            return jnp.take_along_axis(ring, best[..., None], axis=2)[..., 0]
+
+        return jax.lax.fori_loop(0, self.hops, hop, at)
 
     def closest(
         self,
@@ -297,8 +301,7 @@ class _Contact(Prepared):
             pick = jnp.argmin(jnp.sum(gap * gap, axis=2), axis=1)
             there = jnp.take_along_axis(self.listed, pick, axis=1)
             there = self.walk(loose, points, there)
-            order = jnp.argsort(jnp.concatenate([self.tight, self.loose]))
-            last = jnp.concatenate([centre, there])[order]
+            last = jnp.concatenate([centre, there])[self.order]
         face, weights = self.closest(base, start.points, last)
         p0, n0 = _surface(start, self.faces, face, weights)
         p1, n1 = _surface(end, self.faces, face, weights)

@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
-from ._coloured import Coloured, Constraint, Group, colour_groups
+from ._coloured import Coloured, Constraint, Group, colour_group
 from ._hinge import bending_hinges
 
 
@@ -29,25 +29,22 @@ class Dihedral(Effect):
     """
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Colours the hinges so that a Gauss-Seidel sweep runs group by group."""
+        """Colours the hinges so that a Gauss-Seidel sweep runs colour by colour."""
         h = bending_hinges(assembly)
         law = {"compliance": 1.0 / np.maximum(h.stiffness * h.length**2, 1e-12)}
-        return _Dihedral(colour_groups(h.corners, np.asarray(inverse_mass), law))
+        return _Dihedral(colour_group(h.corners, np.asarray(inverse_mass), law))
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Dihedral(Coloured):
-    groups: tuple[Group, ...]
+    group: Group
 
     def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
         if "bend" not in factors:
             return self
-        k = factors["bend"]
-        groups = [
-            dataclasses.replace(g, law={"compliance": g.law["compliance"] / k}) for g in self.groups
-        ]
-        return dataclasses.replace(self, groups=tuple(groups))
+        law = {"compliance": self.group.law["compliance"] / factors["bend"]}
+        return dataclasses.replace(self, group=dataclasses.replace(self.group, law=law))
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
         def angle(x: tuple[Array, ...]) -> Constraint:

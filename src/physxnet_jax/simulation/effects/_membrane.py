@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
-from ._coloured import Coloured, Constraint, Group, colour_groups
+from ._coloured import Coloured, Constraint, Group, colour_group
 from ._hinge import sound
 
 
@@ -48,8 +48,8 @@ class Membrane(Effect):
             "weft": 1.0 / np.maximum(a * fabric[:, 1], 1e-9),
             "shear": 1.0 / np.maximum(a * fabric[:, 2], 1e-9),
         }
-        groups = colour_groups(faces[usable], np.asarray(inverse_mass), law)
-        return _Membrane(groups, 1.0 / self.compression)
+        group = colour_group(faces[usable], np.asarray(inverse_mass), law)
+        return _Membrane(group, 1.0 / self.compression)
 
 
 def rest_frames(
@@ -87,7 +87,7 @@ def rest_frames(
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Membrane(Coloured):
-    groups: tuple[Group, ...]
+    group: Group
     softer: float = dataclasses.field(metadata={"static": True})
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
@@ -117,11 +117,11 @@ class _Membrane(Coloured):
         return [direction("u1", "u2", "warp"), direction("v1", "v2", "weft"), shear]
 
     def diagnose(self, displacement: Array, context: tuple) -> dict[str, Array]:
+        g = self.group
+        x = self._corners([displacement[i] for i in g.index], context[0])
         strain = []
-        for g, edges in zip(self.groups, context, strict=True):
-            x = self._corners([displacement[i] for i in g.index], edges)
-            for one, two in (("u1", "u2"), ("v1", "v2")):
-                w = g.law[one] * x[1] + g.law[two] * x[2]
-                strain.append(jnp.sqrt(jnp.sum(w * w, axis=1)) - 1.0)
+        for one, two in (("u1", "u2"), ("v1", "v2")):
+            w = g.law[one] * x[1] + g.law[two] * x[2]
+            strain.append(jnp.sqrt(jnp.sum(w * w, axis=1)) - 1.0)
         every = jnp.concatenate(strain)
         return {"strain_max": every.max(axis=0), "strain_p99": jnp.quantile(every, 0.99, axis=0)}

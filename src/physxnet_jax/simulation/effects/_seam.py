@@ -11,7 +11,7 @@ from ...errors import SimulationError
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
-from ._coloured import Coloured, Constraint, Group, colour_groups
+from ._coloured import Coloured, Constraint, Group, colour_group
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,20 +30,20 @@ class Seam(Effect):
     stiffness: float = 1e4
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Colours the stitches so that a Gauss-Seidel sweep runs group by group."""
+        """Colours the stitches so that a Gauss-Seidel sweep runs colour by colour."""
         pairs = np.asarray(self.stitches, np.int64).reshape(-1, 2)
         if pairs.size and not (0 <= pairs.min() and pairs.max() < len(assembly.rest)):
             raise SimulationError(
                 f"A stitch names vertex {int(pairs.max())}; the scene has {len(assembly.rest)}."
             )
         law = {"compliance": np.full(len(pairs), 1.0 / self.stiffness)}
-        return _Seam(colour_groups(pairs, np.asarray(inverse_mass), law))
+        return _Seam(colour_group(pairs, np.asarray(inverse_mass), law))
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Seam(Coloured):
-    groups: tuple[Group, ...]
+    group: Group
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
         def open_by(x: tuple[Array, ...]) -> Constraint:

@@ -11,7 +11,7 @@ from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
-from ._coloured import Coloured, Constraint, Group, colour_groups
+from ._coloured import Coloured, Constraint, Group, colour_group
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,14 +35,14 @@ class StrainLimit(Effect):
         ends = mesh_edges(assembly.faces).vertices
         length = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1)
         law = {"longest": (1 + self.limit) * np.maximum(length, 1e-4)}
-        return _StrainLimit(colour_groups(ends, np.asarray(inverse_mass), law))
+        return _StrainLimit(colour_group(ends, np.asarray(inverse_mass), law))
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _StrainLimit(Coloured):
     elastic = False
-    groups: tuple[Group, ...]
+    group: Group
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
         def excess(x: tuple[Array, ...]) -> Constraint:

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ...geometry import greedy_colours, mesh_edges
+from ...geometry import mesh_edges
 from ...typing import pytree
-from .._assembly import Assembly, float32
+from .._assembly import Assembly
 from .._effect import Clock, Effect, Prepared
-from ._coloured import joined, scatter_rows
+from ._coloured import Sheaf, bundled, column, sheaves, sweep
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Stretch(Effect):
     compression: float = 0.2
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Colours the edges so that a Gauss-Seidel sweep runs group by group."""
+        """Colours the edges so that a Gauss-Seidel sweep runs colour by colour."""
         x, f = assembly.rest, assembly.faces
         edges = mesh_edges(f)
         length = np.linalg.norm(x[edges.vertices[:, 0]] - x[edges.vertices[:, 1]], axis=1)
@@ -48,101 +48,97 @@ class Stretch(Effect):
         stiffness = load / np.maximum(length, 1e-4) ** 2
         compliance = 1.0 / np.maximum(stiffness, 1e-6)
         w = np.asarray(inverse_mass)
-        groups = []
-        for members in greedy_colours(edges.vertices, len(x)):
-            a, b = edges.vertices[members].T
-            groups.append(
-                _Group(
-                    jnp.asarray(a),
-                    jnp.asarray(b),
-                    float32(length[members][:, None, None]),
-                    float32(compliance[members][:, None, None]),
-                    float32(w[a][:, None, None]),
-                    float32(w[b][:, None, None]),
-                )
-            )
-        return _Stretch(tuple(groups), 1.0 / self.compression)
+        order, parts = sheaves(edges.vertices, len(x))
+        a, b = edges.vertices[order].T.astype(np.int32)
+        springs = _Springs(
+            (jnp.asarray(a), jnp.asarray(b)),
+            (column(w[a]), column(w[b])),
+            column(length[order]),
+            column(compliance[order]),
+        )
+        return _Stretch(springs, parts, 1.0 / self.compression)
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _Group:
-    a: Int[Array, " members"]
-    b: Int[Array, " members"]
+class _Springs:
+    ends: tuple[Int[Array, " members"], Int[Array, " members"]]
+    weight: tuple[Float[Array, "members 1 1"], Float[Array, "members 1 1"]]
     length: Float[Array, "members 1 1"]
     compliance: Float[Array, "members 1 1"]
-    weight_a: Float[Array, "members 1 1"]
-    weight_b: Float[Array, "members 1 1"]
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Stretch(Prepared):
     elastic = True
-    groups: tuple[_Group, ...]
+    springs: _Springs
+    sheaves: tuple[Sheaf, ...]
     softer: float = dataclasses.field(metadata={"static": True})
 
     def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
         if "stretch" not in factors:
             return self
-        k = factors["stretch"]
-        groups = [dataclasses.replace(g, compliance=g.compliance / k) for g in self.groups]
-        return dataclasses.replace(self, groups=tuple(groups))
+        s = self.springs
+        softer = dataclasses.replace(s, compliance=s.compliance / factors["stretch"])
+        return dataclasses.replace(self, springs=softer)
 
-    def begin(
-        self, base: Array, start: None, end: None, clock: Clock, memory: Any
-    ) -> tuple[Array, ...]:
-        return tuple(base[g.b] - base[g.a] for g in self.groups)
+    def begin(self, base: Array, start: None, end: None, clock: Clock, memory: Any) -> tuple:
+        s = self.springs
+        edge = base[s.ends[1]] - base[s.ends[0]]
+        known = (edge, s.weight, s.length, s.compliance)
+        return edge, bundled(self.sheaves, s.ends, known)
 
     def project(
         self,
         displacement: Array,
         start: Array,
-        context: tuple[Array, ...],
+        context: tuple,
         progress: Array,
         step: tuple[float, float],
     ) -> Array:
         h = step[0]
-        d = displacement
-        for g, edge in zip(self.groups, context, strict=True):
-            da, db = d[g.a], d[g.b]
+
+        def move(rows: list[Array], known: tuple) -> list[Array]:
+            (da, db), (edge, (wa, wb), rest, compliance) = rows, known
             span = edge + (db - da)
             length = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18)
-            excess = length - g.length
-            alpha = g.compliance * jnp.where(excess < 0, self.softer, 1.0) / (h * h)
-            move = span * (excess / (length * (g.weight_a + g.weight_b + alpha)))
-            d = scatter_rows(d, [g.a, g.b], [da + g.weight_a * move, db - g.weight_b * move])
-        return d
+            excess = length - rest
+            alpha = compliance * jnp.where(excess < 0, self.softer, 1.0) / (h * h)
+            pull = span * (excess / (length * (wa + wb + alpha)))
+            return [da + wa * pull, db - wb * pull]
 
-    def energy(self, displacement: Array, context: tuple[Array, ...]) -> Array:
-        g, edge = joined(self.groups), jnp.concatenate(context)
-        span = edge + (displacement[g.b] - displacement[g.a])
-        excess = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18) - g.length
-        alpha = g.compliance * jnp.where(excess < 0, self.softer, 1.0)
+        return sweep(displacement, context[1], move)
+
+    def _spans(self, displacement: Array, context: tuple) -> Array:
+        a, b = self.springs.ends
+        return context[0] + (displacement[b] - displacement[a])
+
+    def energy(self, displacement: Array, context: tuple) -> Array:
+        s, span = self.springs, self._spans(displacement, context)
+        excess = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18) - s.length
+        alpha = s.compliance * jnp.where(excess < 0, self.softer, 1.0)
         return 0.5 * jnp.sum(excess**2 / alpha, axis=(0, 1))
 
     def coupled(self) -> Int[np.ndarray, "blocks 2"]:
-        g = joined(self.groups)
-        a, b = np.asarray(g.a), np.asarray(g.b)
+        a, b = (np.asarray(end) for end in self.springs.ends)
         return np.concatenate([np.column_stack(p) for p in ((a, a), (b, b), (a, b), (b, a))])
 
-    def hessian(self, displacement: Array, context: tuple[Array, ...]) -> Array:
+    def hessian(self, displacement: Array, context: tuple) -> Array:
         """Along the edge always, across it only in tension: so it stays positive."""
-        g, edge = joined(self.groups), jnp.concatenate(context)
+        s = self.springs
         eye = jnp.eye(3, dtype=displacement.dtype)[None, None]
-        span = jnp.swapaxes(edge + (displacement[g.b] - displacement[g.a]), 1, 2)
+        span = jnp.swapaxes(self._spans(displacement, context), 1, 2)
         length = jnp.sqrt(jnp.sum(span * span, axis=2, keepdims=True) + 1e-18)[..., None]
-        rest = g.length[..., None]
-        k = 1.0 / (g.compliance[..., None] * jnp.where(length < rest, self.softer, 1.0))
+        rest = s.length[..., None]
+        k = 1.0 / (s.compliance[..., None] * jnp.where(length < rest, self.softer, 1.0))
         n = span / length[..., 0]
         along = n[..., :, None] * n[..., None, :]
         taut = jnp.maximum(1.0 - rest / length, 0.0)
         block = k * (along + taut * (eye - along))
         return jnp.concatenate([block, block, -block, -block])
 
-    def diagnose(self, displacement: Array, context: tuple[Array, ...]) -> dict[str, Array]:
-        g, edge = joined(self.groups), jnp.concatenate(context)
-        span = edge + (displacement[g.b] - displacement[g.a])
-        length = jnp.sqrt(jnp.sum(span * span, axis=1))
-        every = (length - g.length[:, 0]) / jnp.maximum(g.length[:, 0], 1e-4)
+    def diagnose(self, displacement: Array, context: tuple) -> dict[str, Array]:
+        span, rest = self._spans(displacement, context), self.springs.length[:, 0]
+        every = (jnp.sqrt(jnp.sum(span * span, axis=1)) - rest) / jnp.maximum(rest, 1e-4)
         return {"strain_max": every.max(axis=0), "strain_p99": jnp.quantile(every, 0.99, axis=0)}
