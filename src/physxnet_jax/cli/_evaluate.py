@@ -67,18 +67,13 @@ def evaluate(command: Evaluate, console: Console) -> int:
         with whole_file(command.out.with_suffix(".md")) as part:
             part.write_text(summary_table(rows) + "\n" + error_tables(rows))
         stem = command.out.with_suffix("")
+        # What was only pushed out or asked twice is hardly told apart from bars of its own.
+        known = {r.method for r in rows}
+        drawn = [r for r in rows if r.method.partition("+")[0] not in known - {r.method}]
         for what in ("vertices", "texels"):
             draw_bars(
                 stem.with_name(f"{stem.name}_{what}.png"),
-                [
-                    (
-                        f"{r.template} ({r.engine})",
-                        r.action,
-                        r.method,
-                        getattr(r, f"rmse_{what}_mm"),
-                    )
-                    for r in rows
-                ],
+                [(_panel(r), r.action, r.method, getattr(r, f"rmse_{what}_mm")) for r in drawn],
                 f"RMSE over {what} [mm]",
             )
         console.print(f"wrote {command.out}, .md and two charts", highlight=False)
