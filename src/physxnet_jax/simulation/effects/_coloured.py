@@ -118,7 +118,7 @@ def sweep(
 
     def one(d: Array, colour: tuple) -> tuple[Array, None]:
         index, known, target = colour
-        # Corner by corner: one scatter of all would be computed row by row, four times as long.
+        # Corner by corner: XLA computes what one scatter of all writes anew for each row.
         for at, rows in zip(target, move([d[i] for i in index], known), strict=True):
             d = d.at[at].set(rows, mode="drop", unique_indices=True)
         return d, None
