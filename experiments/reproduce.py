@@ -54,6 +54,9 @@ SETS = {
     "mixed_extra": "legs of extra actions with upper bodies of others, wider",
     "mixed_left_out": "the left out with upper bodies of others, wider",
     "varied": "legs of all with upper bodies of others, slower and wider still",
+    "wide": "legs of all with upper bodies of yet others, half as far again",
+    "swift": "legs of all with upper bodies of yet others, a quarter faster",
+    "varied_left_out": "the left out with upper bodies of yet others, slower and wider still",
     "slow": "training actions at 0.8 of their speed",
     "blender": "protocol, Blender",
 }

@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from physxnet_jax.body import NUM_BODY_VERTICES, bone_directions
+from physxnet_jax.body import NUM_BODY_VERTICES, bone_directions, forward_kinematics
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.geometry import manifold_report
 
@@ -109,6 +110,39 @@ def test_vmap_agrees_with_a_loop_and_gradients_with_differences(body):
         slope = (lift(shape + 0.2 + d, poses[0]) - lift(shape + 0.2 - d, poses[0])) / (2 * step)
         assert float(gs[k]) == pytest.approx(float(slope), rel=0.02, abs=1e-5)
     assert bool(jnp.isfinite(gp).all()) and float(jnp.abs(gp).max()) > 0
+
+
+def by_hand(parents, heads, pose, root):
+    world, place = [], []
+    for j, parent in enumerate(parents):
+        local = Rotation.from_quat(pose[j], scalar_first=True).as_matrix()
+        world.append(local if parent < 0 else world[parent] @ local)
+        reach = None if parent < 0 else world[parent] @ (heads[j] - heads[parent])
+        place.append(np.asarray(root) if parent < 0 else place[parent] + reach)
+    world = np.stack(world)
+    return world, np.stack(place) - np.einsum("jab,jb->ja", world, heads)
+
+
+@pytest.mark.parametrize(
+    "parents",
+    [(-1,), (-1, 0, 1, 2), (-1, 0, 0, 0), (-1, 0, -1, 2, 1, 0), (-1, 0, 1, 1, 0, 4, 5, 2)],
+    ids=["one", "chain", "star", "two roots", "tree"],
+)
+def test_any_tree_of_joints_is_followed(parents):
+    rng = np.random.default_rng(len(parents))
+    heads = rng.normal(size=(len(parents), 3)).astype(np.float32)
+    pose = rng.normal(size=(len(parents), 4)).astype(np.float32)
+    root = rng.normal(size=3).astype(np.float32)
+    want = by_hand(parents, heads, pose, root)
+    args = jnp.asarray(heads), jnp.asarray(pose), jnp.asarray(root)
+    for a, b in zip(forward_kinematics(parents, *args), want, strict=True):
+        np.testing.assert_allclose(np.asarray(a), b, atol=1e-5)
+
+    def total(*args):
+        world, shift = forward_kinematics(parents, *map(jnp.asarray, args))
+        return jnp.sum(jnp.sin(world)) + jnp.sum(jnp.sin(shift))
+
+    check_grads(total, args, order=1, modes=["fwd", "rev"], eps=1e-2, atol=0.05, rtol=0.05)
 
 
 def test_unknown_shape_parameters_are_refused(body):

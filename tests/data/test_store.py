@@ -13,10 +13,12 @@ from physxnet_jax.data import (
     DatasetConfig,
     build_dataset,
     dataset_digest,
+    expected_frames,
     left_out,
     list_sequences,
     load_action,
     make_codec,
+    open_dataset,
     read_protocol,
     read_sequence,
     write_action,
@@ -155,6 +157,21 @@ def test_what_is_left_of_clips_overlaps_no_action(data_dir):
         end, told_end = a.start + a.frames / 30.0, told.start + told.frames / 30.0
         assert end <= told.start + 1e-6 or a.start >= told_end - 1e-6
         assert load_action(data_dir / "mocap", a).num_frames == a.frames
+
+
+@pytest.mark.parametrize(("left", "speed"), [(False, 1.25), (True, 0.8)])
+def test_a_dataset_knows_how_long_its_actions_are(data_dir, tmp_path, left, speed):
+    folder = data_dir / "mocap"
+    note = {"splits": ["extra"], "speed": speed} | ({"left_out": True} if left else {})
+    open_dataset(tmp_path / "set", note)
+    counts = expected_frames(tmp_path / "set", folder)
+    actions = [a for a in read_protocol(folder) if a.split == "extra"]
+    actions = left_out(folder, actions) if left else actions
+    assert list(counts) == [a.name for a in actions]
+    config = DatasetConfig(speed=speed)
+    for a in actions[:2]:
+        assert counts[a.name] == action_motion(config, a, load_body(), folder).num_frames
+        assert counts[a.name] != a.frames
 
 
 def test_unknown_actions_are_named_before_anything_is_built(data_dir, tmp_path):

@@ -14,6 +14,7 @@ from physxnet_jax.motion import (
     at_speed,
     body_animation,
     exaggerated,
+    frames_at_speed,
     load_motion,
     mirror_joints,
     mirrored,
@@ -66,6 +67,7 @@ def test_twice_as_fast_is_every_second_frame():
     slow = at_speed(motion, 0.5)
     np.testing.assert_allclose(slow.root[::2], motion.root, atol=1e-5)
     assert at_speed(motion, 1.0).num_frames == motion.num_frames
+    assert [frames_at_speed(n, 0.8) for n in (1, 2, 5)] == [1, 2, 6]
     with pytest.raises(MotionError, match="positive"):
         at_speed(motion, 0.0)
     assert jnp.isfinite(slow.rotations).all()

@@ -94,17 +94,13 @@ class Body:
 
     def rest_vertices(self, shape: Float[Array, " shapes"]) -> Float[Array, "all 3"]:
         """Rest positions [m] of all vertices, helpers included."""
-        male = shape[0]
-        base = self.bases[0] + male * (self.bases[1] - self.bases[0])
-        deltas = self.deltas[0] + male * (self.deltas[1] - self.deltas[0])
-        return base + jnp.tensordot(shape[1:], deltas, axes=1, precision=jax.lax.Precision.HIGHEST)
+        return _rest_vertices(self.bases, self.deltas, shape)
 
     def joint_positions(
         self, rest: Float[Array, "all 3"]
     ) -> tuple[Float[Array, "joints 3"], Float[Array, "joints 3"]]:
         """Heads and tails of the bones at rest [m]."""
-        ends = jnp.mean(rest[self.joint_rows], axis=2)
-        return ends[:, 0], ends[:, 1]
+        return _joint_positions(rest, self.joint_rows)
 
     def transforms(
         self,
@@ -182,6 +178,22 @@ class Body:
         return self.joint_names.index(name)
 
 
+# Compiled whole: operation by operation, each would be compiled for itself.
+@jax.jit
+def _rest_vertices(bases: Array, deltas: Array, shape: Array) -> Array:
+    male = shape[0]
+    base = bases[0] + male * (bases[1] - bases[0])
+    mixed = deltas[0] + male * (deltas[1] - deltas[0])
+    return base + jnp.tensordot(shape[1:], mixed, axes=1, precision=jax.lax.Precision.HIGHEST)
+
+
+@jax.jit
+def _joint_positions(rest: Array, rows: Array) -> tuple[Array, Array]:
+    ends = jnp.mean(rest[rows], axis=2)
+    return ends[:, 0], ends[:, 1]
+
+
+@jax.jit
 def triangulate(quads: Int[Array, "quads 4"]) -> Int[Array, "triangles 3"]:
     """Two triangles a quad, along the diagonal from its first corner."""
     pairs = jnp.stack([quads[:, jnp.array([0, 1, 2])], quads[:, jnp.array([0, 2, 3])]], 1)

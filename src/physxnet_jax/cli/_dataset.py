@@ -14,9 +14,9 @@ from ..data import (
     Sequence,
     build_dataset,
     dataset_digest,
+    expected_frames,
     list_sequences,
     read_log,
-    read_protocol,
     read_sequence,
 )
 from ..errors import FormatError
@@ -78,7 +78,7 @@ def _check(command: Dataset, console: Console) -> int:
     if not folders:
         raise FormatError(f"{root}: no actions in there.")
     folder = mocap_folder(command.mocap)
-    counts = {a.name: a.frames for a in read_protocol(folder)} if folder.is_dir() else {}
+    counts = expected_frames(root, folder) if folder.is_dir() else {}
     found: list[Finding] = []
     pictures = []
     with progress_bars(console) as progress:

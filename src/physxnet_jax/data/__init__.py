@@ -1,6 +1,10 @@
 """Datasets: the protocol's actions, simulated cloth on disk, batches."""
 
-from ._build import build_dataset as build_dataset, skinned_cloth as skinned_cloth
+from ._build import (
+    build_dataset as build_dataset,
+    expected_frames as expected_frames,
+    skinned_cloth as skinned_cloth,
+)
 from ._codec import Codec as Codec, make_codec as make_codec
 from ._config import CARD as CARD, DatasetConfig as DatasetConfig
 from ._mirror import (

@@ -2,7 +2,7 @@
 
 import pathlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import jax
@@ -12,7 +12,15 @@ import numpy as np
 from ..body import Body
 from ..errors import FormatError
 from ..garment import template
-from ..motion import Motion, animate, at_speed, exaggerated, mirrored, with_upper_body
+from ..motion import (
+    Motion,
+    animate,
+    at_speed,
+    exaggerated,
+    frames_at_speed,
+    mirrored,
+    with_upper_body,
+)
 from ..simulation import PreparedScene, Scene, prepare_scene, simulate_batch
 from ..simulation.blender import simulate_blender
 from ._config import CARD, DatasetConfig
@@ -22,6 +30,7 @@ from ._store import (
     is_stored,
     log_build,
     open_dataset,
+    read_note,
     write_action,
     write_garment,
     write_offsets,
@@ -58,7 +67,7 @@ def build_dataset(
         MotionError: No protocol in ``folder``.
     """
     root = pathlib.Path(root)
-    actions = [a for a in read_protocol(folder) if a.split in config.splits]
+    actions = _chosen(folder, config.splits)
     unknown = set(only) - {a.name for a in actions}
     if unknown:
         raise FormatError(
@@ -90,6 +99,24 @@ def build_dataset(
     if report is not None:
         report("done", len(jobs), len(jobs))
     return done
+
+
+def expected_frames(root: str | pathlib.Path, folder: str | pathlib.Path) -> dict[str, int]:
+    """How many frames each action of a dataset should have, by its own note.
+
+    Args:
+        root: The dataset.
+        folder: Where the motion files and ``ACTIONS.csv`` lie.
+    """
+    note = read_note(root)
+    actions = _chosen(folder, note["splits"])
+    if note.get("left_out", False):
+        actions = left_out(folder, actions)
+    return {a.name: frames_at_speed(a.frames, note.get("speed", 1.0)) for a in actions}
+
+
+def _chosen(folder: str | pathlib.Path, splits: Collection[str]) -> list[Action]:
+    return [a for a in read_protocol(folder) if a.split in splits]
 
 
 def _note(config: DatasetConfig) -> dict[str, Any]:

@@ -1,9 +1,11 @@
 """Barycentric interpolation and the sparse row-stochastic matrix built on it."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 
+@jax.jit
 def interpolate(
     values: Float[Array, "*batch vertices channels"],
     faces: Int[Array, "points 3"],

@@ -72,16 +72,11 @@ def upsampling_kernel(
     """
     # Along one axis: parity 0 sees inputs i-1, i by taps 3, 1; parity 1 sees i, i+1 by
     # taps 2, 0.
-    taps = (((0, 3), (1, 1)), ((1, 2), (2, 0)))
-    inputs, outputs = kernel.shape[2:]
-    parts = []
-    for p in range(2):
-        for q in range(2):
-            part = jnp.zeros((3, 3, inputs, outputs), kernel.dtype)
-            for row, a in taps[p]:
-                for column, b in taps[q]:
-                    part = part.at[row, column].set(kernel[a, b])
-            parts.append(part)
+    parts = [
+        jnp.pad(kernel[3 - p :: -2, 3 - q :: -2], ((p, 1 - p), (q, 1 - q), (0, 0), (0, 0)))
+        for p in range(2)
+        for q in range(2)
+    ]
     return jnp.concatenate(parts, axis=-1)
 
 

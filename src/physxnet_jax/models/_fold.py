@@ -88,36 +88,41 @@ def at_precision(
 
 
 def _down(layer: Down) -> _Convolution:
-    kernel = layer.conv.kernel[...]
-    bias = None if layer.conv.bias is None else layer.conv.bias[...]
-    scale, shift = _affine(layer.norm, kernel.shape[-1], bias)
-    return _Convolution(
-        kernel * scale[None, None, None], shift, stride=2, slope=layer.slope, regroup=False
-    )
+    kernel, shift = _folded(layer.conv.kernel[...], _value(layer.conv.bias), *_plain(layer.norm))
+    return _Convolution(kernel, shift, stride=2, slope=layer.slope, regroup=False)
 
 
 def _up(layer: Up) -> _Convolution:
-    kernel = layer.kernel[...]
-    bias = None if layer.bias is None else layer.bias[...]
-    scale, shift = _affine(layer.norm, kernel.shape[-1], bias)
-    return _Convolution(
-        upsampling_kernel(kernel * scale[None, None, None]),
-        jnp.tile(shift, 4),
-        stride=1,
-        slope=None,
-        regroup=True,
-    )
+    kernel, shift = _folded(layer.kernel[...], _value(layer.bias), *_plain(layer.norm), up=True)
+    return _Convolution(kernel, shift, stride=1, slope=None, regroup=True)
 
 
-def _affine(
-    norm: nnx.BatchNorm | None, channels: int, bias: Array | None
-) -> tuple[Float[Array, " c"], Float[Array, " c"]]:
-    """Scale and shift that stand for a bias and the norm after it."""
-    before = jnp.zeros((channels,), jnp.float32) if bias is None else bias
+def _value(x: nnx.Variable | None) -> Array | None:
+    return None if x is None else x[...]
+
+
+def _plain(norm: nnx.BatchNorm | None) -> tuple[tuple[Array | None, ...], float]:
+    """Variance, mean, scale and bias of a norm, and its epsilon."""
     if norm is None:
-        return jnp.ones((channels,), jnp.float32), before
-    scale = jax.lax.rsqrt(norm.var[...] + norm.epsilon)
-    if norm.scale is not None:
-        scale = scale * norm.scale[...]
-    shift = (before - norm.mean[...]) * scale
-    return scale, shift if norm.bias is None else shift + norm.bias[...]
+        return (None, None, None, None), 0.0
+    return (norm.var[...], norm.mean[...], _value(norm.scale), _value(norm.bias)), norm.epsilon
+
+
+@jax.jit(static_argnames=("epsilon", "up"))
+def _folded(
+    kernel: Float[Array, "h w inputs outputs"],
+    bias: Float[Array, " outputs"] | None,
+    norm: tuple[Array | None, ...],
+    epsilon: float,
+    up: bool = False,
+) -> tuple[Float[Array, "3 3 inputs c"] | Float[Array, "4 4 inputs c"], Float[Array, " c"]]:
+    """Kernel and bias that stand for a convolution and the norm after it."""
+    shift = jnp.zeros(kernel.shape[-1:], kernel.dtype) if bias is None else bias
+    var, mean, gain, offset = norm
+    if var is not None and mean is not None:
+        scale = jax.lax.rsqrt(var + epsilon)
+        scale = scale if gain is None else scale * gain
+        shift = (shift - mean) * scale
+        shift = shift if offset is None else shift + offset
+        kernel = kernel * scale[None, None, None]
+    return (upsampling_kernel(kernel), jnp.tile(shift, 4)) if up else (kernel, shift)

@@ -37,6 +37,7 @@ from ._transforms import (
 from ._variants import (
     at_speed as at_speed,
     exaggerated as exaggerated,
+    frames_at_speed as frames_at_speed,
     mirror_joints as mirror_joints,
     mirrored as mirrored,
     with_upper_body as with_upper_body,

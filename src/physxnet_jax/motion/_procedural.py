@@ -256,8 +256,8 @@ def _planted_root(
     """
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     ankles = [body.joint("LeftFoot"), body.joint("RightFoot")]
-    heads = body.joint_positions(rest)[0][jnp.asarray(ankles)]
-    follow = jnp.zeros((2, len(body.parents))).at[jnp.arange(2), jnp.asarray(ankles)].set(1.0)
+    heads = jnp.asarray(np.asarray(body.joint_positions(rest)[0])[ankles])
+    follow = jnp.asarray(np.eye(len(body.parents), dtype=np.float32)[ankles])
     feet = np.asarray(animate(body, rest, heads, follow, motion), dtype=np.float64)
     left, right = feet[:, 0], feet[:, 1]
     # A soft choice of the standing foot: a hard one would jerk the hips.

@@ -118,7 +118,8 @@ def foot_heights(
 ) -> Float[np.ndarray, " frames"]:
     """Height of the lowest vertex of both feet in each frame [m]."""
     rows = np.flatnonzero(_foot_vertices(body))
-    moved = animate(body, rest, rest[jnp.asarray(rows)], body.weights[jnp.asarray(rows)], motion)
+    feet, weights = (jnp.asarray(np.asarray(x)[rows]) for x in (rest, body.weights))
+    moved = animate(body, rest, feet, weights, motion)
     return np.asarray(moved)[:, :, 1].min(axis=1)
 
 

@@ -54,6 +54,11 @@ def mirrored(body: Body, motion: Motion) -> Motion:
     return make_motion(turned, root, motion.fps, name=motion.name)
 
 
+def frames_at_speed(frames: int, speed: float) -> int:
+    """How many frames are left of a clip that is played so many times as fast."""
+    return int(np.floor((frames - 1) / speed + 1e-6)) + 1
+
+
 def at_speed(motion: Motion, speed: float) -> Motion:
     """The motion played faster or slower, at the same frame rate.
 
@@ -67,7 +72,7 @@ def at_speed(motion: Motion, speed: float) -> Motion:
     if not speed > 0:
         raise MotionError(f"speed is {speed}; it must be positive.")
     last = (motion.num_frames - 1) / motion.fps
-    frames = int(np.floor(last / speed * motion.fps + 1e-6)) + 1
+    frames = frames_at_speed(motion.num_frames, speed)
     times = np.minimum(np.arange(frames) / motion.fps * speed, last)
     out = sample(motion, times, motion.fps)
     return Motion(out.rotations, out.root, motion.fps, motion.name)

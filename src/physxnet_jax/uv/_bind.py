@@ -131,22 +131,23 @@ def bind(
     normals = vertex_normals(points, garment.mesh.faces)
     hits = cast_rays(mesh, points, normals, both=True, max_distance=_REACH[garment.template])
     near = closest_points(mesh, points)
-    reach = jnp.abs(jnp.where(hits.valid, hits.distance, jnp.inf))
-    good = hits.valid & (reach <= _STRAY * jnp.sqrt(near.squared_distance) + 0.01)
-    face = jnp.where(good, hits.face, near.face)
-    weights = jnp.where(good[:, None], hits.weights, near.weights)
-    uv = np.einsum(
-        "vk,vkc->vc",
-        np.asarray(weights),
-        np.asarray(mesh.uv)[np.asarray(mesh.uv_faces)[np.asarray(face)]],
-    )
+    # On the host from here: nothing to compile.
+    reach = np.where(np.asarray(hits.valid), np.abs(np.asarray(hits.distance)), np.inf)
+    good = reach <= _STRAY * np.sqrt(np.asarray(near.squared_distance)) + 0.01
+    face = np.where(good, np.asarray(hits.face), np.asarray(near.face))
+    weights = np.where(good[:, None], np.asarray(hits.weights), np.asarray(near.weights))
+    uv = np.einsum("vk,vkc->vc", weights, np.asarray(mesh.uv)[np.asarray(mesh.uv_faces)[face]])
     texel, weight, off = sampling_weights(atlas, uv, np.asarray(valid), mesh, face, weights)
     return Binding(
-        Transference(mesh.faces[face], weights, jnp.ones(face.shape, bool)),
+        Transference(
+            jnp.asarray(np.asarray(mesh.faces)[face]),
+            jnp.asarray(weights),
+            jnp.asarray(np.ones(face.shape, bool)),
+        ),
         jnp.asarray(texel),
         jnp.asarray(weight),
-        float(np.mean(np.asarray(good))),
-        int(np.sum(~np.asarray(good))),
+        float(np.mean(good)),
+        int(np.sum(~good)),
         off,
     )
 
@@ -156,8 +157,8 @@ def sampling_weights(
     uv: Float[np.ndarray, "points 2"],
     valid: Bool[np.ndarray, " texels"],
     mesh: TriMesh,
-    face: Int[Array, " points"],
-    weights: Float[Array, "points 3"],
+    face: Int[np.ndarray, " points"],
+    weights: Float[np.ndarray, "points 3"],
 ) -> tuple[Int[np.ndarray, "points 4"], Float[np.ndarray, "points 4"], int]:
     """Bilinear weights over valid texels that are neighbours on the body as well.
 
@@ -175,11 +176,7 @@ def sampling_weights(
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
     fx, fy = x - x0, y - y0
     places = np.asarray(atlas.to_body @ mesh.vertices)
-    here = np.einsum(
-        "vk,vkc->vc",
-        np.asarray(weights),
-        np.asarray(mesh.vertices)[np.asarray(mesh.faces)[np.asarray(face)]],
-    )
+    here = np.einsum("vk,vkc->vc", weights, np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]])
     texel = np.zeros((len(uv), 4), dtype=np.int32)
     weight = np.zeros((len(uv), 4))
     # One texel covers about 1.5 m / size of skin; seams are much farther apart.
