@@ -4,6 +4,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 SRC := $(shell find src tests experiments -name '*.py' 2>/dev/null)
 
+# Many processes load the same libraries: the first leaves them compiled.
+export PYTHONDONTWRITEBYTECODE =
+
 .PHONY: demo test check docs format clean
 
 # One environment serves all targets; uv.lock decides every version.

@@ -35,12 +35,9 @@ def test_processors_have_folders_of_their_own(monkeypatch):
 @pytest.fixture
 def run(tmp_path):
     def one(*words):
-        env = {k: v for k, v in os.environ.items() if k != "TF_CPP_MIN_LOG_LEVEL"}
-        # Every program is kept, or how long one took to compile would decide what is.
-        env |= {
-            "XDG_CACHE_HOME": str(tmp_path / "cache"),
-            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        }
+        set_by_tests = ("TF_CPP_MIN_LOG_LEVEL", "JAX_COMPILATION_CACHE_DIR")
+        env = {k: v for k, v in os.environ.items() if k not in set_by_tests}
+        env["XDG_CACHE_HOME"] = str(tmp_path / "cache")
         return subprocess.run(
             [pathlib.Path(sys.executable).parent / "physxnet", *words],
             env=env,

@@ -1,13 +1,11 @@
 """Examples, the notebook and the documents' code run as they stand."""
 
 import json
-import os
 import pathlib
 import re
 import subprocess
 import sys
 
-import jax
 import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -22,15 +20,9 @@ def test_they_are_numbered_without_a_gap():
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
 def test_an_example_runs(path, tmp_path):
     """As a user runs it: a process of its own, in a folder of its own."""
-    # Only not compiled anew what other tests have compiled.
-    environment = os.environ | {
-        "JAX_COMPILATION_CACHE_DIR": str(jax.config.jax_compilation_cache_dir),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0.5",
-    }
     done = subprocess.run(
         [sys.executable, str(path)],
         cwd=tmp_path,
-        env=environment,
         capture_output=True,
         text=True,
         timeout=600,

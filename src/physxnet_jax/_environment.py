@@ -72,7 +72,8 @@ def keep_programs(environment: MutableMapping[str, str] | None = None) -> None:
     env = os.environ if environment is None else environment
     machine = f"{platform.machine()}-{hashlib.sha256(_processor().encode()).hexdigest()[:8]}"
     env.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "programs" / machine))
-    env.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.3")
+    # The small ones as well: there are a hundred, and together they take seconds.
+    env.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     # Loading from the cache, XLA takes its own hints for missing instructions and says so
     # as an error (jax-ml/jax#38445).
     env.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
