@@ -6,16 +6,25 @@ import fast_simplification
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
-from physxnet_jax.body import linear_blend_skinning
+from physxnet_jax.body import Registration, linear_blend_skinning
 from physxnet_jax.cli import main
 from physxnet_jax.dressing import dress, make_character
-from physxnet_jax.dressing._character import _poses as character_poses
+from physxnet_jax.dressing._character import (
+    _corners,
+    _poses as character_poses,
+    clear_of_character,
+    inside_character,
+    on_character,
+)
+from physxnet_jax.dressing._dress import unbound_wearable
+from physxnet_jax.dressing._push_out import make_patch
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import template
-from physxnet_jax.geometry import closest_points, make_mesh
-from physxnet_jax.io import AnimatedMesh
-from physxnet_jax.motion import Motion, body_animation, load_motion
+from physxnet_jax.geometry import closest_points, make_mesh, vertex_normals
+from physxnet_jax.io import AnimatedMesh, smooth_normals
+from physxnet_jax.motion import Motion, body_animation, clip_transforms, load_motion
 
 FPS = 10.0
 
@@ -88,12 +97,69 @@ def test_cloth_goes_along_with_what_no_joint_moves(character):
     )
     swell = np.zeros_like(character.leftover)
     swell[-1] = 0.03 * belly[:, None] * [0.0, 0.0, 1.0]
-    flat = dress(character, ["top"], method="lbs").garments[0].positions
+    plain = {"method": "lbs", "resolve": False}
+    flat = dress(character, ["top"], **plain).garments[0].positions
     grown = dataclasses.replace(character, leftover=character.leftover + swell)
-    out = dress(grown, ["top"], method="lbs").garments[0].positions - flat
+    out = dress(grown, ["top"], **plain).garments[0].positions - flat
     np.testing.assert_allclose(out[:-1], 0.0, atol=1e-6)
     assert 0.015 < out[-1, :, 2].max() <= 0.0301
     assert np.abs(out[-1, :, :2]).max() < 1e-6
+
+
+def test_cloth_is_moved_out_of_the_skin_that_is_seen(character):
+    """Thighs that swell by 2 cm while no cloth goes along."""
+    body, clip = character.body, character.motion
+    rest = body.rest_vertices(body.default_shape())
+    skin = np.asarray(rest)[:13380]
+    thigh = np.abs(skin[:, 1] - (skin[:, 1].min() + 0.65)) < 0.1
+    outward = np.asarray(vertex_normals(jnp.asarray(skin), body.rest_mesh().faces))
+    world, shift = clip_transforms(body, rest, clip)
+    weights = np.asarray(body.weights)[:13380]
+    swollen = 0.02 * np.einsum("vj,fjab,vb->fva", weights, world, outward) * thigh[:, None]
+    swollen = swollen.astype(np.float32)
+    surface = np.asarray(body_animation(body, clip)) + swollen
+    fat = dataclasses.replace(character, leftover=swollen, surface=surface)
+    g = on_character(template("bottom"), character)
+    w = unbound_wearable(body, rest, g)
+    patch = make_patch(body, rest, w, g.mesh)
+    tight = dress(character, ["bottom"], method="lbs", resolve=False).garments[0].positions
+    before = inside_character(fat, tight)
+    out = clear_of_character(patch, w, fat, tight, world, shift)
+    assert before > 0.05 and inside_character(fat, out) < 0.2 * before
+    assert np.linalg.norm(out - tight, axis=2).max() < 0.06
+
+
+def test_skin_that_was_laid_onto_another_limb_is_left_out(man, monkeypatch):
+    """One vertex of a thigh goes along with the hand beside it."""
+    _, _, mesh, bind = man
+    carried = Registration.carried
+    found = make_character(mesh, FPS, bind=bind)
+    hips = found.body.joint("Hips")
+    lost = int(np.argmax(np.asarray(found.body.weights)[:13380, hips]))
+
+    def astray(self, positions, faces):
+        out = carried(self, positions, faces)
+        out[4:, lost] += np.float32(0.5)
+        return out
+
+    monkeypatch.setattr(Registration, "carried", astray)
+    other = make_character(mesh, FPS, bind=bind)
+    assert np.abs(found.leftover[:, lost]).max() > 0
+    assert np.abs(other.leftover[:, lost]).max() == 0
+    rows = np.arange(13380) != lost
+    np.testing.assert_allclose(other.leftover[:, rows], found.leftover[:, rows], atol=2e-3)
+
+
+def test_corners_of_a_coarse_mesh_are_known(character):
+    skin = character.surface[:1]
+    normals = smooth_normals(skin, np.asarray(character.body.rest_mesh().faces))
+    # Where the next vertex is far enough for the nearest one to be the one beneath.
+    rows = np.argsort(-KDTree(skin[0]).query(skin[0], k=2)[0][:, 1])[:3]
+    points = skin[:, rows] + 0.006 * normals[:, rows]
+    rise = _corners(character.body, points, skin)
+    np.testing.assert_allclose(rise[rows], 0.006, atol=1e-4)
+    assert np.count_nonzero(rise) == 3
+    assert _corners(character.body, skin[:, rows] - 0.006 * normals[:, rows], skin).max() == 0.0
 
 
 def test_what_a_character_brings_cannot_be_given(body, character):

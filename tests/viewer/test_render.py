@@ -1,5 +1,6 @@
 """Pictures: not empty, and videos of the right length."""
 
+import dataclasses
 import gc
 
 import numpy as np
@@ -31,6 +32,21 @@ def test_a_dressed_person_is_in_the_picture(tmp_path):
     assert frames.shape[0] == 4
     assert np.abs(frames[3] - frames[0]).mean() > 0.3, "nobody moves"
     assert np.asarray(iio.imread(tmp_path / "a.png")).std() > 5
+
+
+def test_who_jumps_stays_in_the_picture():
+    person = dress("walk", ["bottom"], method="lbs", frames=2).meshes[0]
+    high = person.positions + np.array([[[0.0, 0.0, 0.0]], [[0.0, 0.9, 0.0]]], np.float32)
+    jump = dataclasses.replace(person, positions=high)
+
+    def seen(frame):
+        image = render_frame([jump], frame, size=(160, 192)).astype(int)
+        return image[..., 0] - image[..., 2] > 20
+
+    for frame in (0, 1):
+        skin = seen(frame)
+        assert skin.any() and not skin[:3].any() and not skin[-3:].any()
+    assert abs(seen(0).sum() - seen(1).sum()) < 0.25 * seen(0).sum()
 
 
 def test_columns_show_the_same_moment_under_their_titles(tmp_path):

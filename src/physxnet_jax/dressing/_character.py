@@ -4,21 +4,30 @@ import dataclasses
 import pathlib
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from ..body import Body, clothed_vertices, load_body, register_body
 from ..errors import MeshError
 from ..garment import Garment
 from ..io import AnimatedMesh, read_character, smooth_normals
-from ..motion import Motion, body_animation, follow_surface
+from ..models import Wearable, skin_points
+from ..motion import BLOCK, Motion, body_animation, follow_surface, padded_block
+from ._push_out import SkinPatch, each_frame, push_out_of
 
 # Skin whose leftover movement a garment vertex takes over: so many vertices, over so far [m].
 _SKIN, _WIDTH = 24, 0.03
 # Cloth deeper than this under the nearest skin is beneath another limb [m].
 _DEEPEST = 0.06
+# Skin that goes this far from where the joints take it isn't that skin [m].
+_STRAY = 0.15
+# Corners of a mesh stand no farther out of it than this [m].
+_RISE = 0.015
+# Triangles that are looked through for those near cloth; how far it slides at most [m].
+_LOOKED_THROUGH, _SLIDE = 40, 0.15
 # Frames that are looked at for how much of a garment is inside.
 _LOOKED_AT = 40
 
@@ -35,6 +44,8 @@ class Character:
         leftover: What skinning that body leaves between it and the person's surface [m],
             shape [frames, 13380, 3]; zero where the surfaces don't meet.
         surface: The body's vertices on the person's surface [m], shape likewise.
+        rise: How far corners of a coarse mesh stand out of the surface through those
+            vertices [m], shape [13380].
         apart: Mean distance between the two, where clothes hang, fitted by shape and
             pose alone [m].
         missed: Share of the vertices there that found no surface.
@@ -47,6 +58,7 @@ class Character:
     motion: Motion
     leftover: Float[np.ndarray, "frames vertices 3"]
     surface: Float[np.ndarray, "frames vertices 3"]
+    rise: Float[np.ndarray, " vertices"]
     apart: float
     missed: float
     notes: tuple[str, ...] = ()
@@ -122,11 +134,18 @@ def make_character(
     surface = found.carried(mesh.positions, mesh.faces)
     body = base.with_rest(jnp.asarray(found.rest))
     clothed = clothed_vertices(base)
-    motion = follow_surface(body, surface, found.sure & clothed, fps, name=mesh.name)
-    skinned = np.asarray(body_animation(body, motion))
-    leftover = np.where((found.sure & clothed)[None, :, None], surface - skinned, 0.0)
+    sure = found.sure & clothed
+    for _ in range(2):
+        motion = follow_surface(body, surface, sure, fps, name=mesh.name)
+        leftover = surface - np.asarray(body_animation(body, motion))
+        # Skin that goes elsewhere was laid onto another limb: a thigh onto a hand beside it.
+        stray = sure & (np.linalg.norm(leftover, axis=2).max(axis=0) > _STRAY)
+        if not stray.any():
+            break
+        sure = sure & ~stray
+    leftover = np.where(sure[None, :, None], leftover, 0.0)
     notes = (
-        f"the body lies {1e3 * float(found.distance[clothed & found.sure].mean()):.0f} mm from"
+        f"the body lies {1e3 * float(found.distance[sure].mean()):.0f} mm from"
         f" yours by shape and pose; the rest, and {_mm(leftover[:, clothed])} that skinning"
         " leaves, is carried over",
     )
@@ -137,10 +156,27 @@ def make_character(
         motion,
         leftover.astype(np.float32),
         surface,
-        float(found.distance[clothed & found.sure].mean()),
-        float(1.0 - found.sure[clothed].mean()),
+        _corners(body, mesh.positions, surface),
+        float(found.distance[sure].mean()),
+        float(1.0 - sure[clothed].mean()),
         notes,
     )
+
+
+def _corners(
+    body: Body,
+    positions: Float[np.ndarray, "frames points 3"],
+    surface: Float[np.ndarray, "frames vertices 3"],
+) -> Float[np.ndarray, " vertices"]:
+    """How far a person's own vertices stand above the surface through the body's [m]."""
+    frames = np.linspace(0, len(positions) - 1, _LOOKED_AT // 4).astype(int)
+    normals = smooth_normals(surface[frames], np.asarray(body.rest_mesh().faces))
+    out = np.zeros(surface.shape[1], np.float32)
+    for k, f in enumerate(frames):
+        distance, near = map(np.asarray, KDTree(surface[f]).query(positions[f]))
+        height = np.einsum("vc,vc->v", positions[f] - surface[f, near], normals[k, near])
+        np.maximum.at(out, near, np.where(distance < 2 * _RISE, height, 0.0).clip(0.0, _RISE))
+    return out
 
 
 def _mm(gap: np.ndarray) -> str:
@@ -187,6 +223,82 @@ def follow_leftover(
     for k in range(_SKIN):
         out += weight[:, k, None] * character.leftover[: len(out), rows[near[:, k]]]
     return out
+
+
+def clear_of_character(
+    patch: SkinPatch,
+    wearable: Wearable,
+    character: Character,
+    positions: Float[np.ndarray, "frames vertices 3"],
+    world: Float[np.ndarray, "frames joints 3 3"],
+    shift: Float[np.ndarray, "frames joints 3"],
+) -> Float[np.ndarray, "frames vertices 3"]:
+    """A garment moved out of the person's own surface, see `push_out`.
+
+    The surface is looked for where the garment is, not where it lay at rest: on knees and
+    elbows that another rig bends, cloth slides.
+
+    Args:
+        patch: The skin near each of its vertices.
+        wearable: The garment at rest.
+        character: The person.
+        positions: Of the garment [m].
+        world: World rotations of the joints.
+        shift: World translations of the joints [m].
+    """
+    frames = len(positions)
+    leftover = character.leftover[:frames, np.asarray(patch.used)]
+    lying = np.arange(positions.shape[1])
+    lying = lying if patch.skirt is None else np.asarray(patch.skirt.lying)
+    still = np.asarray(wearable.rest)[lying]
+    rise = character.rise[np.asarray(patch.used)][np.asarray(patch.faces)].max(axis=1)
+    least = np.array(patch.least)
+    least += np.quantile(rise, 0.95).astype(least.dtype)
+    least[lying] = np.asarray(patch.least)[lying] + rise[np.asarray(patch.candidates)].max(axis=1)
+    most = np.maximum(np.asarray(patch.most), least)
+    patch = dataclasses.replace(patch, least=jnp.asarray(least), most=jnp.asarray(most))
+    blocks = []
+    for at in range(0, frames, BLOCK):
+        x, r, t, left = (padded_block(v, at, 0) for v in (positions, world, shift, leftover))
+        skin = np.asarray(_skin_block(patch, jnp.asarray(r), jnp.asarray(t), jnp.asarray(left)))
+        near = np.stack([_near(patch, still, s, p[lying]) for s, p in zip(skin, x, strict=True)])
+        out = _clear_block(patch, *(jnp.asarray(v) for v in (x, r, skin, near)))
+        blocks.append(np.asarray(out))
+    return np.concatenate(blocks)[:frames]
+
+
+def _near(
+    patch: SkinPatch,
+    still: Float[np.ndarray, "lying 3"],
+    skin: Float[np.ndarray, "skin 3"],
+    points: Float[np.ndarray, "lying 3"],
+) -> Int[np.ndarray, "lying k"]:
+    """The nearest triangles that aren't another limb's: those lay farther off at rest."""
+    faces, usual = np.asarray(patch.faces), np.asarray(patch.candidates)
+    found = KDTree(skin[faces].mean(axis=1)).query(points, k=_LOOKED_THROUGH)[1]
+    place = np.asarray(patch.rest)[faces].mean(axis=1)
+    own = np.linalg.norm(place[found] - still[:, None], axis=2) < _SLIDE
+    first = np.argsort(~own, axis=1, kind="stable")[:, : usual.shape[1]]
+    found, own = (np.take_along_axis(v, first, axis=1) for v in (found, own))
+    return np.where(own, found, usual).astype(np.int32)
+
+
+@jax.jit
+def _skin_block(patch: SkinPatch, world: Array, shift: Array, leftover: Array) -> Array:
+    def one(r: Array, t: Array, left: Array) -> Array:
+        return skin_points(patch.rest, patch.weights, r, t)[0] + left
+
+    return jax.vmap(one)(world, shift, leftover)
+
+
+@jax.jit
+def _clear_block(
+    patch: SkinPatch, positions: Array, world: Array, skin: Array, near: Array
+) -> Array:
+    def one(x: Array, r: Array, s: Array, k: Array) -> Array:
+        return push_out_of(patch, x, r, s, k)
+
+    return each_frame(one, positions, world, skin, near)
 
 
 def inside_character(

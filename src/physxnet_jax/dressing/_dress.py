@@ -25,7 +25,13 @@ from ..motion import (
 from ..simulation import ACCURACY
 from ..uv import Binding, Transference, bind
 from ._blocks import inside_share, predict_clip, simulate_clip
-from ._character import Character, follow_leftover, inside_character, on_character
+from ._character import (
+    Character,
+    clear_of_character,
+    follow_leftover,
+    inside_character,
+    on_character,
+)
 from ._layers import make_layers
 from ._meshes import animated_meshes, with_names
 from ._push_out import make_patch, tuck_in
@@ -188,6 +194,11 @@ def dress(
     with watch("body"):
         if person is not None:
             positions = {g.name: follow_leftover(g, person, positions[g.name]) for g in garments}
+            if resolve:
+                positions = {
+                    w.name: clear_of_character(p, w, person, positions[w.name], world, shift)
+                    for w, p in zip(wearables, patches, strict=True)
+                }
             inside = {g.name: inside_character(person, positions[g.name]) for g in garments}
         meshes = animated_meshes(body, clip, shape, garments, positions, include_body)
         if person is not None and include_body:

@@ -7,7 +7,7 @@ from typing import TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, Shaped
 from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body, blend_rotations
@@ -43,7 +43,8 @@ class SkinPatch:
     """The skin near each garment vertex.
 
     Attributes:
-        rest: Body vertices used, at rest [m], shape [skin, 3].
+        used: Body vertices that are near, shape [skin].
+        rest: Those at rest [m], shape [skin, 3].
         normals: Their unit normals at rest, shape [skin, 3].
         weights: Their skinning weights, shape [skin, joints].
         faces: Triangles over them, shape [faces, 3].
@@ -54,6 +55,7 @@ class SkinPatch:
         carry: How a lifted part of a skirt carries its neighbourhood along; likewise.
     """
 
+    used: Int[Array, " skin"]
     rest: Float[Array, "skin 3"]
     normals: Float[Array, "skin 3"]
     weights: Float[Array, "skin joints"]
@@ -92,13 +94,14 @@ def make_patch(
         taken = np.concatenate([taken, np.asarray(skirt.table).ravel()])
     used, local = np.unique(taken, return_inverse=True)
     rows, corners = np.unique(faces[used], return_inverse=True)
-    pick = jnp.asarray(rows)
+    pick = jnp.asarray(rows.astype(np.int32))
     if skirt is not None:
         # In terms of the vertices and triangles that are kept.
         middle = np.searchsorted(rows, np.asarray(skirt.middles)).astype(np.int32)
         table = local[near.size :].reshape(skirt.table.shape).astype(np.int32)
         skirt = dataclasses.replace(skirt, middles=jnp.asarray(middle), table=jnp.asarray(table))
     return SkinPatch(
+        pick,
         mesh.vertices[pick],
         vertex_normals(mesh.vertices, mesh.faces)[pick],
         body.weights[pick],
@@ -168,8 +171,19 @@ def skin_height(
         rotations: World rotations of joints.
         translations: World translations of joints [m].
     """
+    return _clearance(patch, points, _posed(patch, rotations, translations), rotations)
+
+
+def _posed(patch: SkinPatch, rotations: Array, translations: Array) -> tuple[Array, Array]:
+    """Skin and its normals, shape [skin, 3] each."""
     skin, blend = skin_points(patch.rest, patch.weights, rotations, translations)
-    normals = jnp.einsum("vab,vb->va", blend, patch.normals)
+    return skin, jnp.einsum("vab,vb->va", blend, patch.normals)
+
+
+def _clearance(
+    patch: SkinPatch, points: Array, posed: tuple[Array, Array], rotations: Array
+) -> tuple[Float[Array, " vertices"], Float[Array, "vertices 3"]]:
+    skin, normals = posed
     if patch.skirt is None:
         return _clear_of_skin(patch, skin, normals, points, patch.least, patch.most)
     lying, rows = patch.skirt.lying, patch.skirt.rows
@@ -220,14 +234,40 @@ def push_out(
         rotations: World rotations of joints.
         translations: World translations of joints [m].
     """
-    move = skin_height(patch, points, rotations, translations)[1]
+    return _cleared(patch, points, _posed(patch, rotations, translations), rotations)
+
+
+def push_out_of(
+    patch: SkinPatch,
+    points: Float[Array, "vertices 3"],
+    rotations: Float[Array, "joints 3 3"],
+    skin: Float[Array, "skin 3"],
+    candidates: Int[Array, "lying k"],
+) -> Float[Array, "vertices 3"]:
+    """The same as `push_out` for skin that isn't where skinning puts it.
+
+    Args:
+        patch: The skin near each point at rest.
+        points: Garment vertices [m].
+        rotations: World rotations of joints.
+        skin: Where the patch's skin is [m].
+        candidates: Its triangles near each vertex there.
+    """
+    near = dataclasses.replace(patch, candidates=candidates)
+    return _cleared(near, points, (skin, vertex_normals(skin, patch.faces)), rotations)
+
+
+def _cleared(
+    patch: SkinPatch, points: Array, posed: tuple[Array, Array], rotations: Array
+) -> Float[Array, "vertices 3"]:
+    move = _clearance(patch, points, posed, rotations)[1]
     if patch.carry is None:
         return points + move
     points = points + patch.carry @ move
-    return points + skin_height(patch, points, rotations, translations)[1]
+    return points + _clearance(patch, points, posed, rotations)[1]
 
 
-def each_frame(function: Callable[..., _Result], *frames: Float[Array, "frames ..."]) -> _Result:
+def each_frame(function: Callable[..., _Result], *frames: Shaped[Array, "frames ..."]) -> _Result:
     """A function of one frame applied to each, differentiable.
 
     CPUs take one frame after the other: what lies between fits their caches. A gradient

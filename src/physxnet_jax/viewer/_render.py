@@ -14,6 +14,8 @@ from ..files import whole_file
 from ..io import AnimatedMesh
 
 PREVIEWS = (".mp4", ".gif", ".png")
+# Height that is shown at least, floor included [m].
+_SPAN = 1.8
 
 
 def _plotter(size: tuple[int, int]) -> Any:
@@ -45,9 +47,10 @@ class _Stage:
         if title:
             self.plotter.add_text(title, position="upper_edge", font_size=12, color="#202428")
         self.meshes = meshes
-        everything = np.concatenate([m.positions[0] for m in meshes])
         self.floor = float(min(m.positions[..., 1].min() for m in meshes))
-        self.height = float(np.ptp(everything[:, 1]))
+        # High jumps and raised arms stay in the picture.
+        top = float(max(m.positions[..., 1].max() for m in meshes))
+        self.span = max(top - self.floor, _SPAN)
         path = np.concatenate([m.positions.mean(axis=1) for m in meshes[:1]])
         middle, reach = path.mean(axis=0), 2.5 + np.ptp(path, axis=0).max()
         ground = pyvista.Plane(
@@ -76,8 +79,8 @@ class _Stage:
                 reset_camera=False,
                 backface_params={"color": tuple(0.6 * c for c in m.colour)},
             )
-        target = np.array([centre[0], self.floor + 0.9, centre[2]])
-        eye = target + np.array([1.3, 0.5, 3.4])
+        target = np.array([centre[0], self.floor + 0.5 * self.span, centre[2]])
+        eye = target + np.array([1.3, 0.5, 3.4]) * (self.span / _SPAN)
         self.plotter.camera_position = [tuple(eye), tuple(target), (0.0, 1.0, 0.0)]
         self.plotter.camera.view_angle = 32.0
         # A screenshot alone would show the meshes from where the camera stood before.
