@@ -79,6 +79,8 @@ def main() -> None:
     note_datasets(pathlib.Path(words.learn_from).parent)
     blocks = {"summary": summary_table(rows), "errors": error_tables(rows), "claims": claims(rows)}
     blocks["datasets"] = dataset_table()
+    more = [ActionError(**r) for r in json.loads((RESULTS / "more_motion.json").read_text())]
+    blocks["more_motion"] = more_motion(rows, more)
     for name in (
         "ablations",
         "unseen",
@@ -189,6 +191,20 @@ def note_measured(name: str, rows: list[ActionError]) -> None:
     ]
     with whole_file(path) as part:
         part.write_text(json.dumps(card, indent=1))
+
+
+def more_motion(rows: list[ActionError], more: list[ActionError]) -> str:
+    """The shipped network beside the one taught from half as much motion again."""
+    lines = ["| asked | top, mm | bottom, mm | dress, mm |", "|---|---|---|---|"]
+    asked = {"local": rows, "local-wide": more, "local+mirror": rows, "local-wide+mirror": more}
+    for name, measured in asked.items():
+        cells = []
+        for t in TEMPLATES:
+            found = means(measured, name, t, "physxnet")["rmse_vertices_mm"]
+            skinned = means(rows, "lbs", t, "physxnet")["rmse_vertices_mm"]
+            cells.append(f"{found:.1f} ({found / skinned:.3f})")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
 def claims(rows: list[ActionError]) -> str:

@@ -275,7 +275,8 @@ def _near(
 ) -> Int[np.ndarray, "lying k"]:
     """The nearest triangles that aren't another limb's: those lay farther off at rest."""
     faces, usual = np.asarray(patch.faces), np.asarray(patch.candidates)
-    found = KDTree(skin[faces].mean(axis=1)).query(points, k=_LOOKED_THROUGH)[1]
+    count = min(_LOOKED_THROUGH, len(faces))
+    found = np.asarray(KDTree(skin[faces].mean(axis=1)).query(points, k=count)[1])
     place = np.asarray(patch.rest)[faces].mean(axis=1)
     own = np.linalg.norm(place[found] - still[:, None], axis=2) < _SLIDE
     first = np.argsort(~own, axis=1, kind="stable")[:, : usual.shape[1]]
