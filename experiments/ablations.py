@@ -63,6 +63,7 @@ VARIANTS: dict[str, tuple[TrainConfig, tuple[str, ...]]] = {
     ),
     "adversarial": (varied(adversarial=True), ("data",)),
     "squared": (varied(squared=True), ("data",)),
+    "by Muon": (varied(optimiser="muon"), ("data",)),
     "one frame": (varied(model=seen(frames=1)), ("data",)),
     "no acceleration": (varied(model=seen(acceleration=False)), ("data",)),
     "no gravity": (varied(model=seen(gravity=False)), ("data",)),

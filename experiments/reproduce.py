@@ -23,6 +23,7 @@ from physxnet_jax.data import dataset_digest, list_sequences, read_log, read_seq
 from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
 from physxnet_jax.files import whole_file
 from physxnet_jax.garment import TEMPLATES
+from physxnet_jax.io import MIRROR
 from physxnet_jax.training import teaches
 
 ROOT = pathlib.Path(__file__).parents[1]
@@ -36,15 +37,17 @@ METHODS = (
     "runs/local-22",
     *(
         f"{n}{m}{p}"
-        for n in ("nano", "small", "local")
+        for n in ("nano", "small", "local", "pair")
         for m in ("", "+mirror")
         for p in ("", "+push")
     ),
+    "local-muon",
+    "local-muon+mirror",
     "paper",
     "draft",
     "noise",
 )
-NETWORKS = ("local-22", "nano", "small", "local", "paper")
+NETWORKS = ("local-22", "nano", "small", "local", "local-muon", "pair", "paper")
 SETS = {
     "ours": "protocol",
     "mirror": "mirrored training actions",
@@ -112,7 +115,7 @@ def main() -> None:
 def write_ladder(rows: list[ActionError]) -> None:
     """The errors by which `physxnet dress --budget-ms` chooses."""
     # The teacher itself is as far from itself as two of its runs part.
-    shipped = [m for m in METHODS if m.startswith(("nano", "small", "local"))]
+    shipped = [m for m in METHODS if m.startswith(("nano", "small", "local", "pair"))]
     names = {n: n for n in ("lbs", *shipped, "draft")} | {"noise": "standard"}
     rungs = []
     for method, name in names.items():
@@ -194,9 +197,13 @@ def note_measured(name: str, rows: list[ActionError]) -> None:
 
 
 def more_motion(rows: list[ActionError], more: list[ActionError]) -> str:
-    """The shipped network beside the one taught from half as much motion again."""
+    """One recipe with more motion, with another optimiser, and two networks' mean."""
     lines = ["| asked | top, mm | bottom, mm | dress, mm |", "|---|---|---|---|"]
-    asked = {"local": rows, "local-wide": more, "local+mirror": rows, "local-wide+mirror": more}
+    asked = {
+        f"{name}{mirror}": more if name == "local-wide" else rows
+        for mirror in ("", MIRROR)
+        for name in ("local", "local-wide", "local-muon", "pair")
+    }
     for name, measured in asked.items():
         cells = []
         for t in TEMPLATES:

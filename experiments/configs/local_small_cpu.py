@@ -9,20 +9,10 @@ Result:  the rows `small` of experiments/results/test_errors.md: the recipe and 
          `local_cpu.py`.
 """
 
-from physxnet_jax.models import Inputs, ModelConfig
-from physxnet_jax.training import TrainConfig
+import dataclasses
+import pathlib
+import runpy
 
-CONFIG = TrainConfig(
-    model=ModelConfig(Inputs("local"), resolution=64, width=16),
-    epochs=2,
-    batch=8,
-    learning_rate=3e-3,
-    schedule="cosine",
-    adversarial=False,
-    vertex_share=0.7,
-    mirror=True,
-    validation=("kick ball",),
-    validate_every=1000,
-    patience=12,
-    checkpoint_every=500,
-)
+_LOCAL = runpy.run_path(str(pathlib.Path(__file__).with_name("local_cpu.py")))["CONFIG"]
+
+CONFIG = dataclasses.replace(_LOCAL, model=dataclasses.replace(_LOCAL.model, width=16))

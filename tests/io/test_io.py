@@ -17,6 +17,7 @@ from physxnet_jax.io import (
     read_obj,
     read_pc2,
     save_predictor,
+    weights_size,
     write_clip,
     write_obj,
     write_pc2,
@@ -182,8 +183,23 @@ def test_meshes_that_are_nowhere_near_a_body_are_refused(tmp_path):
         load_garment(tmp_path / "a.fbx")
 
 
+def test_a_mean_of_networks_names_what_it_averages(tmp_path):
+    pair, parts = load_predictor("pair+mirror"), ("local", "local-muon")
+    assert pair.mirrored and read_card("pair")["mean_of"] == list(parts)
+    assert weights_size("pair") == sum(map(weights_size, parts))
+    with pytest.raises(WeightsError, match="isn't saved"):
+        save_predictor(tmp_path / "w", pair, name="copy")
+    # Other networks than those that were measured, itself among them, or none of the package.
+    for named in (["local", "small"], ["pair", "pair"], ["../weights/local", "local-muon"], []):
+        card = tmp_path / "other/card.json"
+        card.parent.mkdir(exist_ok=True)
+        card.write_text(json.dumps(read_card("pair") | {"mean_of": named}))
+        with pytest.raises(WeightsError, match="networks of this"):
+            load_predictor(card.parent)
+
+
 def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
-    assert list_weights() == ["local", "nano", "paper", "small"]
+    assert list_weights() == ["local", "local-muon", "nano", "pair", "paper", "small"]
     predictor = load_predictor("local")
     assert read_card("local")["model"]["inputs"]["family"] == "local"
     save_predictor(tmp_path / "w", predictor, name="copy")

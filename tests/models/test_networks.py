@@ -19,8 +19,8 @@ from physxnet_jax.models import (
     Predictor,
     ask_mirrored,
     at_precision,
+    average_networks,
     clip_features,
-    depth_to_space,
     dress_frames,
     fold_batch_norm,
     make_generator,
@@ -32,6 +32,7 @@ from physxnet_jax.models import (
     skin_wearable,
     start_stream,
     stream_frame,
+    upsample,
     upsampling_kernel,
 )
 from physxnet_jax.motion import clip_transforms, load_motion
@@ -40,15 +41,12 @@ from physxnet_jax.uv import bind, garment_map_rows, make_atlas
 NHWC = ("NHWC", "HWIO", "NHWC")
 
 
-def test_depth_to_space_equals_a_transposed_convolution_with_its_gradients():
+def test_upsampling_equals_a_transposed_convolution_with_its_gradients():
     k = jax.random.normal(jax.random.key(0), (4, 4, 5, 7))
     x = jax.random.normal(jax.random.key(1), (2, 6, 8, 5))
 
     def fast(k, x):
-        out = jax.lax.conv_general_dilated(
-            x, upsampling_kernel(k), (1, 1), ((1, 1), (1, 1)), dimension_numbers=NHWC
-        )
-        return depth_to_space(out)
+        return upsample(x, upsampling_kernel(k))
 
     def textbook(k, x):
         # Stride 2, padding 1: each input pixel stamps the kernel; as a dilated convolution.
@@ -68,6 +66,18 @@ def test_depth_to_space_equals_a_transposed_convolution_with_its_gradients():
     ]
     for a, b in zip(*grads):
         np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=2e-3)
+    # Forward mode, in one argument alone and in both, and the second derivative between them.
+    dk, dx = jnp.sin(k), jnp.cos(x)
+    for change in ((dk, jnp.zeros_like(x)), (jnp.zeros_like(k), dx), (dk, dx)):
+        a, b = (jax.jvp(f, (k, x), change)[1] for f in (fast, textbook))
+        np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=2e-3)
+    a, b = (jax.jvp(lambda x, f=f: f(k, x), (x,), (dx,))[1] for f in (fast, textbook))
+    np.testing.assert_allclose(np.asarray(a), np.asarray(b), atol=2e-3)
+    mixed = [
+        jax.grad(lambda k, f=f: jnp.sum(jax.jvp(lambda x: f(k, x), (x,), (dx,))[1] * target))(k)
+        for f in (fast, textbook)
+    ]
+    np.testing.assert_allclose(*map(np.asarray, mixed), atol=2e-3)
 
 
 @pytest.mark.parametrize("size", [(32, 32), (16, 48)])
@@ -355,6 +365,39 @@ def test_folded_networks_answer_as_before(worn):
     again = fold_batch_norm(folded)
     for one, two in zip(jax.tree.leaves(folded.state), jax.tree.leaves(again.state), strict=True):
         np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
+
+
+def test_networks_averaged_answer_the_mean_of_their_answers(worn):
+    """Offsets in metres are averaged, whatever each network scales them by."""
+    atlas, surface, _ = worn
+    one, two = (trained_like(surface, atlas, LOCAL, seed=k) for k in (0, 1))
+    wide = {t: 1.7 * v for t, v in two.normalisation.offset.items()}
+    two = dataclasses.replace(
+        two, normalisation=dataclasses.replace(two.normalisation, offset=wide)
+    )
+    x = jax.random.normal(jax.random.key(3), (2, surface.rest.shape[0], LOCAL.channels))
+    asked = [p.from_features(0.3 * x, ("dress", "top")) for p in (one, two)]
+    mean = average_networks([one, two])
+    for p in (mean, fold_batch_norm(mean), fold_batch_norm(fold_batch_norm(mean))):
+        got = p.from_features(0.3 * x, ("dress", "top"))
+        for t in ("dress", "top"):
+            a, b = (np.asarray(o[t]) for o in asked)
+            # Longer offsets than training shows are shortened, before the mean or after it.
+            plain = (np.linalg.norm([a, b], axis=-1).max(0) < 0.29)[..., None]
+            assert plain.mean() > 0.3 and np.abs(a - b).max() > 0.01
+            np.testing.assert_allclose(np.asarray(got[t]) * plain, (a + b) / 2 * plain, atol=2e-5)
+    # Neither network was changed by it.
+    np.testing.assert_array_equal(
+        np.asarray(two.from_features(0.3 * x, ("top",))["top"]), np.asarray(asked[1]["top"])
+    )
+    other = dataclasses.replace(
+        two, normalisation=dataclasses.replace(two.normalisation, velocity=jnp.float32(2.0))
+    )
+    for wrong in ([], [one, other], [one, dataclasses.replace(two, mirrored=True)]):
+        with pytest.raises(ValueError, match=r"no predictors|different"):
+            average_networks(wrong)
+    with pytest.raises(ValueError, match="before their batch norm is folded"):
+        average_networks([one, fold_batch_norm(two)])
 
 
 def test_fewer_bits_change_little_and_more_bits_next_to_nothing(worn):

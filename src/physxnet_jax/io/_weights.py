@@ -18,10 +18,12 @@ from ..errors import WeightsError
 from ..files import whole_file
 from ..models import (
     Inputs,
+    MeanGenerator,
     ModelConfig,
     Normalisation,
     Predictor,
     ask_mirrored,
+    average_networks,
     make_generator,
     make_surface,
 )
@@ -31,6 +33,7 @@ DEFAULT = "local"
 MIRROR = "+mirror"
 """Behind the name of weights: the network is asked for the mirrored person too."""
 _TENSORS, _CARD = "weights.safetensors", "card.json"
+_PACKAGED = pathlib.Path(str(importlib.resources.files(__package__ or "") / "weights"))
 
 
 def save_predictor(
@@ -49,6 +52,8 @@ def save_predictor(
         card: Anything else to tell: data, licence, measured table.
     """
     folder = pathlib.Path(folder)
+    if isinstance(nnx.merge(predictor.graph, predictor.state), MeanGenerator):
+        raise WeightsError(f"{name}: a mean of networks isn't saved; save the networks.")
     tensors: dict[str, np.ndarray] = {}
     for k, (path, x) in enumerate(jax.tree_util.tree_leaves_with_path(predictor.state)):
         # Batch statistics keep float32: a variance may leave the range of float16.
@@ -81,8 +86,9 @@ def save_predictor(
 
 def list_weights() -> list[str]:
     """Names of the weights in the package."""
-    root = importlib.resources.files(__name__.rpartition(".")[0]) / "weights"
-    return sorted(p.name for p in root.iterdir() if (p / _CARD).is_file()) if root.is_dir() else []
+    if not _PACKAGED.is_dir():
+        return []
+    return sorted(p.name for p in _PACKAGED.iterdir() if (p / _CARD).is_file())
 
 
 def read_card(weights: str | pathlib.Path = DEFAULT) -> dict[str, Any]:
@@ -92,7 +98,9 @@ def read_card(weights: str | pathlib.Path = DEFAULT) -> dict[str, Any]:
 
 def weights_size(weights: str | pathlib.Path = DEFAULT) -> int:
     """Bytes of a network's tensors on disk."""
-    return (_folder(weights) / _TENSORS).stat().st_size
+    folder = _folder(weights)
+    parts = _parts(json.loads((folder / _CARD).read_text()))
+    return sum((f / _TENSORS).stat().st_size for f in parts or [folder])
 
 
 def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
@@ -129,8 +137,23 @@ def _model(card: dict[str, Any]) -> ModelConfig:
     )
 
 
+def _parts(card: dict[str, Any]) -> list[pathlib.Path]:
+    """Folders of the packaged networks whose answers are averaged; mostly none."""
+    return [_PACKAGED / name for name in card.get("mean_of", ()) if name in list_weights()]
+
+
 def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
     card = json.loads((folder / _CARD).read_text())
+    if "mean_of" in card:
+        parts = _parts(card)
+        told = [json.loads((p / _CARD).read_text()) for p in parts]
+        digest = hashlib.sha256("".join(c.get("sha256", "") for c in told).encode()).hexdigest()
+        if digest != card["sha256"] or any("mean_of" in c for c in told):
+            raise WeightsError(
+                f"{weights}: {', '.join(map(str, card['mean_of']))} aren't the networks of this"
+                " card. Reinstall the package."
+            )
+        return average_networks([_load(p.name, p) for p in parts])
     blob = (folder / _TENSORS).read_bytes()
     digest = hashlib.sha256(blob).hexdigest()
     if digest != card["sha256"]:
@@ -185,8 +208,7 @@ def _folder(weights: str | pathlib.Path) -> pathlib.Path:
     path = pathlib.Path(name)
     if (path / _CARD).is_file():
         return path
-    root = importlib.resources.files(__name__.rpartition(".")[0]) / "weights" / name
-    packaged = pathlib.Path(str(root))
+    packaged = _PACKAGED / name
     if not (packaged / _CARD).is_file():
         raise WeightsError(
             f"No weights '{weights}': neither a folder with {_CARD} nor one of"

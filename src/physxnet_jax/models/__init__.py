@@ -2,7 +2,7 @@
 
 from ._blocks import (
     Up as Up,
-    depth_to_space as depth_to_space,
+    upsample as upsample,
     upsampling_kernel as upsampling_kernel,
 )
 from ._features import (
@@ -14,6 +14,7 @@ from ._features import (
     skin_points as skin_points,
 )
 from ._fold import at_precision as at_precision, fold_batch_norm as fold_batch_norm
+from ._mean import MeanGenerator as MeanGenerator, average_networks as average_networks
 from ._networks import Discriminator as Discriminator, Generator as Generator
 from ._predictor import (
     ModelConfig as ModelConfig,

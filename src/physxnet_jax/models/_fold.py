@@ -8,34 +8,31 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
-from ._blocks import Down, Up, depth_to_space, upsampling_kernel
+from ._blocks import Down, Up, upsample, upsampling_kernel
+from ._mean import MeanGenerator
 from ._networks import Generator
 from ._predictor import Predictor
 
 
 class _Convolution(nnx.Module):
-    """A convolution with a bias, and what follows it."""
+    """A convolution to half or twice the size, its bias, and what follows it."""
 
-    def __init__(
-        self, kernel: Array, bias: Array, *, stride: int, slope: float | None, regroup: bool
-    ) -> None:
+    def __init__(self, kernel: Array, bias: Array, *, slope: float | None, up: bool) -> None:
         self.kernel, self.bias = nnx.Param(kernel), nnx.Param(bias)
-        self.stride, self.slope, self.regroup = stride, slope, regroup
+        self.slope, self.up = slope, up
 
     def __call__(
         self, x: Float[Array, "batch height width channels"]
     ) -> Float[Array, "batch h w outputs"]:
         """Features of half or twice the size."""
-        x = jax.lax.conv_general_dilated(
-            x,
-            self.kernel[...].astype(x.dtype),
-            (self.stride, self.stride),
-            ((1, 1), (1, 1)),
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        )
+        kernel = self.kernel[...].astype(x.dtype)
+        if self.up:
+            x = upsample(x, kernel)
+        else:
+            x = jax.lax.conv_general_dilated(
+                x, kernel, (2, 2), ((1, 1), (1, 1)), dimension_numbers=("NHWC", "HWIO", "NHWC")
+            )
         x = x + self.bias[...].astype(x.dtype)[None, None, None]
-        if self.regroup:
-            x = depth_to_space(x)
         return x if self.slope is None else jnp.where(x > 0, x, self.slope * x)
 
 
@@ -49,12 +46,19 @@ def fold_batch_norm(predictor: Predictor) -> Predictor:
     The result can be differentiated but isn't meant to be trained or saved.
 
     Args:
-        predictor: A predictor with a `Generator`.
+        predictor: A predictor with a `Generator`, or with several that are averaged.
 
     Returns:
         The folded predictor; answers differ by rounding alone.
     """
     network = nnx.merge(predictor.graph, predictor.state, copy=True)
+    for one in network.networks if isinstance(network, MeanGenerator) else (network,):
+        _fold(one)
+    graph, state = nnx.split(network)
+    return dataclasses.replace(predictor, graph=graph, state=state)
+
+
+def _fold(network: Any) -> None:
     if not isinstance(network, Generator):
         raise TypeError(f"a Generator is wanted, got {type(network).__name__}.")
     parts: Any = network
@@ -63,8 +67,6 @@ def fold_batch_norm(predictor: Predictor) -> Predictor:
     for decoder in parts.decoders.values():
         for k, layer in enumerate(decoder.layers):
             decoder.layers[k] = _up(layer) if isinstance(layer, Up) else layer
-    graph, state = nnx.split(parts)
-    return dataclasses.replace(predictor, graph=graph, state=state)
 
 
 def at_precision(
@@ -89,12 +91,12 @@ def at_precision(
 
 def _down(layer: Down) -> _Convolution:
     kernel, shift = _folded(layer.conv.kernel[...], _value(layer.conv.bias), *_plain(layer.norm))
-    return _Convolution(kernel, shift, stride=2, slope=layer.slope, regroup=False)
+    return _Convolution(kernel, shift, slope=layer.slope, up=False)
 
 
 def _up(layer: Up) -> _Convolution:
     kernel, shift = _folded(layer.kernel[...], _value(layer.bias), *_plain(layer.norm), up=True)
-    return _Convolution(kernel, shift, stride=1, slope=None, regroup=True)
+    return _Convolution(kernel, shift, slope=None, up=True)
 
 
 def _value(x: nnx.Variable | None) -> Array | None:
@@ -115,7 +117,7 @@ def _folded(
     norm: tuple[Array | None, ...],
     epsilon: float,
     up: bool = False,
-) -> tuple[Float[Array, "3 3 inputs c"] | Float[Array, "4 4 inputs c"], Float[Array, " c"]]:
+) -> tuple[Float[Array, "2 2 inputs fourfold"] | Float[Array, "4 4 inputs c"], Float[Array, " c"]]:
     """Kernel and bias that stand for a convolution and the norm after it."""
     shift = jnp.zeros(kernel.shape[-1:], kernel.dtype) if bias is None else bias
     var, mean, gain, offset = norm
@@ -125,4 +127,4 @@ def _folded(
         shift = (shift - mean) * scale
         shift = shift if offset is None else shift + offset
         kernel = kernel * scale[None, None, None]
-    return (upsampling_kernel(kernel), jnp.tile(shift, 4)) if up else (kernel, shift)
+    return (upsampling_kernel(kernel), shift) if up else (kernel, shift)

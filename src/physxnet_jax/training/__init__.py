@@ -18,6 +18,11 @@ from ._losses import (
     masked_l2 as masked_l2,
     soft_labels as soft_labels,
 )
+from ._optimiser import (
+    make_optimiser as make_optimiser,
+    orthogonalise as orthogonalise,
+    scale_by_orthogonal_momentum as scale_by_orthogonal_momentum,
+)
 from ._step import (
     ClothTables as ClothTables,
     Steps as Steps,

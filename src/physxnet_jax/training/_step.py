@@ -26,6 +26,7 @@ from ..uv import Atlas, Transference
 from ._batches import target_offsets
 from ._config import TrainConfig
 from ._losses import adversarial_loss, discriminator_loss, masked_l1, masked_l2, soft_labels
+from ._optimiser import make_optimiser
 
 Batch = dict[str, Any]
 
@@ -76,17 +77,6 @@ class ClothTables:
     wearable: Wearable
 
 
-def make_optimiser(config: TrainConfig, rate: float, steps: int) -> optax.GradientTransformation:
-    """Adam as in the paper; updates that aren't finite are skipped and counted."""
-    schedule = (
-        optax.warmup_cosine_decay_schedule(0.0, rate, max(steps // 50, 1), max(steps, 2))
-        if config.schedule == "cosine"
-        else optax.constant_schedule(rate)
-    )
-    # The loop gives up after max_skipped; the optimiser itself must never let one in.
-    return optax.apply_if_finite(optax.adam(schedule, b1=config.momentum), 2**31 - 2)
-
-
 @dataclasses.dataclass(frozen=True)
 class Steps:
     """A run's functions, all jitted.
@@ -125,7 +115,8 @@ def make_step(
         rngs=nnx.Rngs(config.seed + 1),
     )
     d_graph, d_params, d_rest = nnx.split(judge, nnx.Param, ...)
-    g_tx = make_optimiser(config, config.learning_rate, steps)
+    kernel_rate = config.kernel_rate if config.optimiser == "muon" else None
+    g_tx = make_optimiser(config, config.learning_rate, steps, kernel_rate=kernel_rate)
     d_tx = make_optimiser(config, config.discriminator_rate, steps)
     state = TrainState(
         g_params,
