@@ -19,15 +19,16 @@ import re
 import statistics
 
 from physxnet_jax.cli import main as physxnet
-from physxnet_jax.data import dataset_digest, list_sequences, read_log, read_sequence
+from physxnet_jax.data import CARD, dataset_digest, list_sequences, read_log, read_sequence
 from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
 from physxnet_jax.files import whole_file
 from physxnet_jax.garment import TEMPLATES
-from physxnet_jax.io import MIRROR
+from physxnet_jax.io import MIRROR, save_mean
 from physxnet_jax.training import teaches
 
 ROOT = pathlib.Path(__file__).parents[1]
 RESULTS = ROOT / "experiments/results"
+WEIGHTS = ROOT / "src/physxnet_jax/io/weights"
 OUT = RESULTS / "test_errors.json"
 # A run that isn't shipped is named by its folder.
 METHODS = (
@@ -107,6 +108,7 @@ def main() -> None:
             text = mark.sub(lambda m, b=block: f"{m[1]}{b.strip()}\n{m[2]}", text)
         with whole_file(path) as part:
             part.write_text(text)
+    save_mean(WEIGHTS / "pair", ("local", "local-muon"), card=CARD)
     for name in NETWORKS:
         note_measured(name, rows)
     write_ladder(rows)
@@ -177,7 +179,7 @@ def dataset_table() -> str:
 
 def note_measured(name: str, rows: list[ActionError]) -> None:
     """Writes the means of packaged weights into their card."""
-    path = ROOT / "src/physxnet_jax/io/weights" / name / "card.json"
+    path = WEIGHTS / name / "card.json"
     if not path.is_file():
         return
     card = json.loads(path.read_text())

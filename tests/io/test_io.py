@@ -16,6 +16,7 @@ from physxnet_jax.io import (
     read_card,
     read_obj,
     read_pc2,
+    save_mean,
     save_predictor,
     weights_size,
     write_clip,
@@ -187,6 +188,10 @@ def test_a_mean_of_networks_names_what_it_averages(tmp_path):
     pair, parts = load_predictor("pair+mirror"), ("local", "local-muon")
     assert pair.mirrored and read_card("pair")["mean_of"] == list(parts)
     assert weights_size("pair") == sum(map(weights_size, parts))
+    save_mean(tmp_path / "pair", parts, card={"licence": "as theirs"})
+    assert weights_size(tmp_path / "pair") == weights_size("pair")
+    again = read_card(tmp_path / "pair")
+    assert again["licence"] and again["sha256"] == read_card("pair")["sha256"]
     with pytest.raises(WeightsError, match="isn't saved"):
         save_predictor(tmp_path / "w", pair, name="copy")
     # Other networks than those that were measured, itself among them, or none of the package.

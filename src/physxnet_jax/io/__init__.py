@@ -20,6 +20,7 @@ from ._weights import (
     list_weights as list_weights,
     load_predictor as load_predictor,
     read_card as read_card,
+    save_mean as save_mean,
     save_predictor as save_predictor,
     weights_size as weights_size,
 )

@@ -5,6 +5,7 @@ import hashlib
 import importlib.resources
 import json
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -84,6 +85,27 @@ def save_predictor(
             part.write_bytes(data)
 
 
+def save_mean(
+    folder: str | pathlib.Path, parts: Sequence[str], *, card: dict[str, Any] | None = None
+) -> None:
+    """Writes the card of packaged networks whose answers are averaged: it has no tensors.
+
+    Args:
+        folder: Where ``card.json`` goes; its name is theirs together.
+        parts: Names of `list_weights`.
+        card: Anything else to tell: licence, measured table.
+    """
+    folder = pathlib.Path(folder)
+    digest = _digest([read_card(p) for p in parts])
+    info = {"name": folder.name, "mean_of": list(parts), "sha256": digest, **(card or {})}
+    with whole_file(folder / _CARD) as part:
+        part.write_text(json.dumps(info, indent=1))
+
+
+def _digest(cards: Sequence[dict[str, Any]]) -> str:
+    return hashlib.sha256("".join(c["sha256"] for c in cards).encode()).hexdigest()
+
+
 def list_weights() -> list[str]:
     """Names of the weights in the package."""
     if not _PACKAGED.is_dir():
@@ -147,8 +169,7 @@ def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
     if "mean_of" in card:
         parts = _parts(card)
         told = [json.loads((p / _CARD).read_text()) for p in parts]
-        digest = hashlib.sha256("".join(c.get("sha256", "") for c in told).encode()).hexdigest()
-        if digest != card["sha256"] or any("mean_of" in c for c in told):
+        if _digest(told) != card["sha256"] or any("mean_of" in c for c in told):
             raise WeightsError(
                 f"{weights}: {', '.join(map(str, card['mean_of']))} aren't the networks of this"
                 " card. Reinstall the package."

@@ -108,7 +108,7 @@ def _windows(x: Array, kernel: Array) -> Array:
 
 
 def _windows_jvp(primals: tuple[Array, Array], tangents: tuple[Any, Any]) -> tuple[Array, Any]:
-    # XLA's own gradient for the kernel takes a loop on CPUs that is ten times slower.
+    # XLA's own gradient for the kernel is many times slower on CPUs.
     (x, kernel), (dx, dkernel) = primals, tangents
     out = _windows(x, kernel)
     change = jnp.zeros_like(out)

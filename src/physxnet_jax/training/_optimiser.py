@@ -58,8 +58,8 @@ def scale_by_orthogonal_momentum() -> optax.GradientTransformation:
     """Momentum (Nesterov's) whose matrix has all its singular values near one.
 
     Kernels [height, width, inputs, outputs] are matrices from all they see to their
-    outputs. ``optax.contrib.muon`` does the same; it iterates on the whole matrix, which
-    on two cores takes as long as the network, and this one on its small Gram matrix.
+    outputs. ``optax.contrib.muon`` does the same, but iterates on the whole matrix: ten
+    products of it in place of two, and small ones of its Gram matrix.
 
     References:
         Jordan et al., Muon: an optimizer for hidden layers in neural networks (2024).
@@ -87,11 +87,11 @@ def _orthogonal_kernel(kernel: Float[Array, "*seen outputs"]) -> Float[Array, "*
 
 
 def orthogonalise(matrix: Float[Array, "rows columns"]) -> Float[Array, "rows columns"]:
-    """The matrix with singular values brought near one (0.7 to 1.2), its directions kept.
+    """The matrix with singular values brought near one (0.6 to 1.25), its directions kept.
 
     Newton-Schulz steps X <- X (a + b X'X + c (X'X)^2) commute with X'X, so that their
     product is found among matrices of columns x columns alone. Singular values below
-    about 1/500 of the norm stay below 0.7. A zero matrix stays zero.
+    about 1/500 of the norm stay smaller. A zero matrix stays zero.
 
     Args:
         matrix: No more columns than rows.
