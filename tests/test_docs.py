@@ -9,7 +9,7 @@ import shlex
 import pytest
 
 from physxnet_jax.cli import parse
-from physxnet_jax.data import DatasetConfig
+from physxnet_jax.data import DatasetConfig, read_protocol
 from physxnet_jax.dressing import dress, load_scene
 from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
 from physxnet_jax.garment import FABRICS, TEMPLATES
@@ -55,6 +55,19 @@ def test_the_joint_map_that_is_shown_is_one(tmp_path):
     path.write_text(re.search(r"```toml\n(.*?)```", text, re.S).group(1))
     joints = read_joint_map(path)
     assert len(joints) == 13 and all(f"`{b}`" in text or f"{b} =" in text for b in joints)
+
+
+def test_the_protocol_is_the_one_that_was_measured(data_dir):
+    text = (ROOT / "docs/protocol.md").read_text()
+    rows = [[c.strip() for c in r.split("|")[1:-1]] for r in text.splitlines() if "| " in r]
+    told = [
+        (r[0], r[1], float(r[4]), float(r[5]), int(r[6]))
+        for r in rows
+        if r[0] in ("train", "test", "extra")
+    ]
+    assert told == [
+        (a.split, a.name, a.fps, a.start, a.frames) for a in read_protocol(data_dir / "mocap")
+    ]
 
 
 def test_every_effect_is_listed():

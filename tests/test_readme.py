@@ -23,7 +23,17 @@ def test_every_command_parses_and_every_target_exists():
         assert (ROOT / path).is_file(), path
     words = set(re.findall(r"physxnet (\w+)", TEXT))
     there = {"dress", "demo", "doctor", "clips", "simulate", "effects", "bench", "stress"}
-    there |= {"dataset", "train", "evaluate", "export", "calibrate", "inspect", "fit", "view"}
+    there |= {
+        "dataset",
+        "train",
+        "evaluate",
+        "export",
+        "calibrate",
+        "inspect",
+        "fit",
+        "rest",
+        "view",
+    }
     assert words <= there
     with pytest.raises(SystemExit):
         main(["undress"])

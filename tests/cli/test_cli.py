@@ -1,15 +1,16 @@
 """The command: what it writes, what it prints, how it fails."""
 
 import json
+import pathlib
 
 import numpy as np
 import pytest
 
 from physxnet_jax._environment import check_jaxlib, jaxlib_problem
 from physxnet_jax.cli import main
-from physxnet_jax.errors import BrokenInstallError
+from physxnet_jax.errors import BrokenInstallError, MotionError
 from physxnet_jax.garment import template
-from physxnet_jax.io import write_obj
+from physxnet_jax.io import load_garment, read_obj, write_obj
 
 
 def test_doctor_and_clips_print_what_there_is(capsys):
@@ -93,6 +94,10 @@ def test_dress_writes_and_reports(tmp_path, capsys, method):
         (["dress", "walk", "--shape", "gender=nan"], "from 0 to 1"),
         (["dress", "walk", "--weights", "none"], "local"),
         (["dress", "walk", "--frames", "0"], "at least one"),
+        (
+            ["dress", "walk", "--budget-ms", "5", "--max-error-mm", "9"],
+            "either a time (--budget-ms)",
+        ),
     ],
 )
 def test_errors_are_one_sentence_and_exit_code_two(capsys, words, says):
@@ -109,13 +114,49 @@ def test_a_joint_map_reaches_the_reader(tmp_path, capsys):
         "HIERARCHY\nROOT pelvis\n{\nOFFSET 0 0 0\nCHANNELS 3 Zrotation Yrotation Xrotation\n"
         "End Site\n{\nOFFSET 0 1 0\n}\n}\nMOTION\nFrames: 1\nFrame Time: 0.1\n0 0 0\n"
     )
-    for words in (["dress"], ["simulate"]):
+    for words in (["dress"], ["simulate"], ["effects"]):
         words = [*words, str(tmp_path / "a.bvh"), "--joint-map", str(path)]
         assert main(words) == 2
         # Without the map the names themselves would be unknown.
         assert "the joint map lacks" in " ".join(capsys.readouterr().err.split())
         assert main(words[:2]) == 2
         assert "unknown joints" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize("command", ["dress", "simulate", "effects", "view"])
+def test_skeleton_and_rate_reach_the_reader(command, tmp_path, monkeypatch):
+    asked = []
+
+    def read(motion, **options):
+        asked.append(options)
+        raise MotionError("enough")
+
+    monkeypatch.setattr("physxnet_jax.motion.load_motion", read)
+    monkeypatch.setattr("physxnet_jax.dressing._scene_file.load_motion", read)
+    monkeypatch.setattr("physxnet_jax.viewer._job.load_motion", read)
+    words = ["--skeleton", "b.asf", "--source-fps", "60"]
+    words += ["--html", str(tmp_path / "a.html")] if command == "view" else []
+    assert main([command, "a.amc", *words]) == 2
+    assert asked[0]["skeleton"] == pathlib.Path("b.asf") and asked[0]["source_fps"] == 60.0
+
+
+def test_the_body_at_rest_is_something_to_model_on(tmp_path, body, rest):
+    assert main(["rest", "-o", str(tmp_path), "--wear", "top"]) == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["body.obj", "top.obj"]
+    skin = read_obj(tmp_path / "body.obj")
+    np.testing.assert_allclose(skin.vertices, body.rest_mesh().vertices, atol=1e-6)
+    assert skin.faces.shape == body.rest_mesh().faces.shape and skin.uv is not None
+    # What is modelled on it is worn where it was modelled.
+    again, report = load_garment(tmp_path / "top.obj")
+    assert (report.unit, report.up, again.template) == ("m", "Y", "top")
+    np.testing.assert_allclose(again.mesh.vertices, template("top").mesh.vertices, atol=0.004)
+    large = tmp_path / "large"
+    words = ["rest", "--wear", "top", "--shape", "weight_up=1", "-o", str(large), "--quiet"]
+    assert main(words) == 0
+    shape = body.shape(weight_up=1.0)
+    found = read_obj(large / "top.obj").vertices
+    expected = template("top").rest_vertices(body.rest_vertices(shape))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
 def test_other_body_shapes_stand_on_the_floor(tmp_path):

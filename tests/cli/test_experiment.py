@@ -1,6 +1,7 @@
 """From a configuration to a table of errors, through the command line, at toy size."""
 
 import json
+import shutil
 
 import pytest
 
@@ -63,6 +64,10 @@ def test_build_train_evaluate(data_dir, tmp_path, capsys):
     again = json.loads((tmp_path / "errors.json").read_text())
     assert [r.pop("ms_per_frame") > 0 for r in again] == [True] * len(rows)
     assert again == [{k: v for k, v in r.items() if k != "ms_per_frame"} for r in rows]
+    # Whose rows are all there needn't be.
+    shutil.rmtree(run)
+    assert main([*measure, "--quiet"]) == 0
+    assert main([*measure[:-1], str(tmp_path / "anew.json"), "--quiet"]) == 2
     capsys.readouterr()
     assert main(["evaluate", run, "elsewhere/run", "--data", root, "--split", "train"]) != 0
     assert "two methods are called run" in capsys.readouterr().err

@@ -8,7 +8,12 @@ import pytest
 
 from physxnet_jax.cli import main
 from physxnet_jax.dressing import load_scene, make_scene
-from physxnet_jax.errors import FormatError, MissingDependencyError, SimulationError
+from physxnet_jax.errors import (
+    FormatError,
+    MissingDependencyError,
+    MotionError,
+    SimulationError,
+)
 from physxnet_jax.evaluation import price_effects, recommend_effects
 from physxnet_jax.garment import square_sheet
 from physxnet_jax.motion import load_motion
@@ -51,6 +56,22 @@ def test_a_scene_file_is_simulated_and_written(tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "scene.toml"]
 
 
+def test_of_a_scene_file_frames_alone_can_be_told_otherwise(tmp_path, capsys):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(TOML)
+    out = tmp_path / "a.npz"
+    assert main(["simulate", str(scene), "--frames", "2", "-o", str(out), "--quiet"]) == 0
+    with np.load(out) as data:
+        assert data["bottom_positions"].shape[0] == 2
+    assert main(["simulate", str(scene), "--frames", "0"]) == 2
+    assert "at least one" in capsys.readouterr().err
+    for words in (["--wear", "dress"], ["--fps", "25"], ["--wind", "0", "0", "1"]):
+        assert main(["simulate", str(scene), *words]) == 2
+        assert f"leave {words[0]} out" in " ".join(capsys.readouterr().err.split())
+    assert main(["effects", str(scene), "--wear", "top"]) == 2
+    assert "leave --wear out" in " ".join(capsys.readouterr().err.split())
+
+
 def test_scene_files_say_what_they_hold(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(TOML)
@@ -65,14 +86,49 @@ def test_scene_files_say_what_they_hold(tmp_path):
     assert LayerContact() in both.scene.effects
 
 
+def test_a_folder_of_other_things_is_neither_used_nor_removed(tmp_path):
+    scene = prepare_scene(
+        Scene((square_sheet(5, pinned=np.arange(5)),), (Gravity(), Stretch(), Pin()))
+    )
+    motion = load_motion("balance", fps=10.0)
+    theirs = tmp_path / "results"
+    theirs.mkdir()
+    (theirs / "thesis.txt").write_text("years")
+    with pytest.raises(SimulationError, match="no rollout's"):
+        simulate_batch(scene, [motion], solver=XPBD(8, 2), resume=theirs)
+    assert [p.name for p in theirs.iterdir()] == ["thesis.txt"]
+    keep = tmp_path / "keep"
+
+    def put(done, total):
+        (keep / "notes.txt").write_text("mine")
+
+    simulate_batch(scene, [motion], solver=XPBD(8, 2), resume=keep, progress=put)
+    assert [p.name for p in keep.iterdir()] == ["notes.txt"]
+
+
+def test_a_motion_is_simulated_at_the_rate_that_is_asked_for():
+    walk = load_motion("walk", fps=60.0)
+    assert make_scene(walk, ["bottom"]).motion.fps == 60.0
+    half = make_scene(walk, ["bottom"], fps=30.0).motion
+    assert half.fps == 30.0 and half.num_frames == -(-walk.num_frames // 2)
+    assert make_scene("walk", ["bottom"]).motion.fps == 30.0
+    spoiled = dataclasses.replace(walk, root=walk.root.at[3].set(np.nan))
+    with pytest.raises(MotionError, match="frame 3"):
+        make_scene(spoiled, ["bottom"])
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
         ("motion = ", "TOML"),
         ("fps = 3.0", "no key motion"),
+        ('motion = "walk"\nsource_fps = -1', "source_fps is -1"),
+        ('motion = "a.amc"\nskeleton = 3', "skeleton can't be 3"),
         ('motion = "walk"\nwear = ["top"]', "unknown key wear"),
         ('motion = "walk"\n[also.rain]', "no effect 'rain'"),
         ('motion = "walk"\n[also.air]\nstorm = 1', "air has no 'storm'"),
+        ('motion = "walk"\n[also.stretch]\ncompression = 0', "stretch: compression is 0"),
+        ('motion = "walk"\n[also.membrane]\ncompression = -1', "membrane: compression is -1"),
         ('motion = "walk"\naccuracy = "best"', "draft, standard, fine"),
         ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = "tin"', "cotton"),
         ('motion = "walk"\n[[garments]]\nname = "top"', "file and fabric"),

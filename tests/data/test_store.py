@@ -1,5 +1,6 @@
 """Datasets: quantised to 0.05 mm, whole or absent, resumed."""
 
+import dataclasses
 import functools
 import zlib
 
@@ -28,7 +29,7 @@ from physxnet_jax.data import (
 from physxnet_jax.data._build import action_motion
 from physxnet_jax.errors import FormatError, MotionError
 from physxnet_jax.garment import square_sheet
-from physxnet_jax.motion import load_motion
+from physxnet_jax.motion import load_motion, make_motion, save_motion
 from physxnet_jax.simulation import XPBD
 
 
@@ -94,6 +95,28 @@ def test_a_dataset_is_the_same_bytes_again_and_damage_is_seen(tmp_path):
     note.write_text(note.read_text().replace('"sha256":"', '"sha256":"0'))
     with pytest.raises(FormatError, match="checksum"):
         read_sequence(folder)
+
+
+def test_what_is_being_written_is_not_there_yet(tmp_path):
+    folder, offsets = stored(tmp_path)
+    write_offsets(folder, "top", offsets, {"finite": True})
+    digest = dataset_digest(tmp_path)
+    part = folder / ".bottom.part"
+    part.mkdir()
+    (part / "zarr.json").write_text((folder / "top" / "zarr.json").read_text())
+    assert list(read_sequence(folder).offsets) == ["top"]
+    assert dataset_digest(tmp_path) == digest
+
+
+def test_garments_stay_with_the_motion_that_they_were_simulated_on(tmp_path):
+    folder, _ = stored(tmp_path)
+    walk = load_motion("walk")
+    write_action(folder, walk, "train")
+    with pytest.raises(FormatError, match="another version"):
+        write_action(folder, load_motion("punch"), "train")
+    with pytest.raises(FormatError, match="another version"):
+        write_action(folder, dataclasses.replace(walk, root=walk.root + 0.01), "train")
+    np.testing.assert_array_equal(read_sequence(folder).motion.root, walk.root)
 
 
 def test_explosions_are_refused_and_leave_nothing(tmp_path):
@@ -181,6 +204,29 @@ def test_unknown_actions_are_named_before_anything_is_built(data_dir, tmp_path):
     ):
         build_dataset(config, tmp_path / "d", data_dir / "mocap", only=("run", "fly"))
     assert not (tmp_path / "d").exists()
+
+
+@pytest.mark.parametrize("names", [("Jump!", "jump"), ("walk", "\u6b69\u304f")])
+def test_actions_without_a_folder_of_their_own_are_refused(tmp_path, names):
+    head = "split,action,file,start_s,frames_at_30fps\n"
+    rows = [f"train,{n},a.bvh,0,30\n" for n in names]
+    (tmp_path / "ACTIONS.csv").write_text(head + "".join(rows), encoding="utf-8")
+    with pytest.raises(MotionError, match="no folder of its own"):
+        read_protocol(tmp_path)
+
+
+def test_what_is_left_of_a_clip_begins_after_the_longest_action(tmp_path):
+    """An action within another: what lies after the inner one is still used."""
+    walk = load_motion("walk", fps=30.0)
+    turns = np.tile(np.asarray(walk.rotations), (8, 1, 1))[:600]
+    root = np.tile(np.asarray(walk.root), (8, 1))[:600]
+    save_motion(tmp_path / "a.npz", make_motion(turns, root, 30.0))
+    (tmp_path / "ACTIONS.csv").write_text(
+        "split,action,file,start_s,frames_at_30fps\n"
+        "train,long,a.npz,0.0,300\ntrain,short,a.npz,2.0,30\n"
+    )
+    found = left_out(tmp_path, read_protocol(tmp_path))
+    assert [a.start for a in found] == [10.0, 10.0]
 
 
 def test_a_missing_protocol_is_named(tmp_path):

@@ -1,5 +1,6 @@
 """Clothes as a layer: live, batched, differentiated and exported, always the same."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -111,6 +112,17 @@ def test_an_export_runs_without_this_package(dresser, whole, motion, tmp_path):
     (tmp_path / "out" / "dresser.jaxexport").write_bytes(b"spoiled")
     done = subprocess.run([sys.executable, str(script)], capture_output=True, text=True)
     assert done.returncode != 0 and "damaged" in done.stderr
+
+
+def test_templates_are_bound_where_they_lie_on_a_body_of_other_proportions(body):
+    large = dataclasses.replace(body, bases=1.15 * body.bases, deltas=1.15 * body.deltas)
+    ours, theirs = (
+        make_dresser(["bottom"], body=b, weights="nano", resolve=False) for b in (body, large)
+    )
+    tied = theirs.wearables[0].binding
+    assert tied.hit_rate > 0.95 and tied.fallbacks <= ours.wearables[0].binding.fallbacks + 30
+    same = np.asarray(tied.texel) == np.asarray(ours.wearables[0].binding.texel)
+    assert same.all(axis=1).mean() > 0.9
 
 
 def test_unknown_platforms_are_named(dresser, tmp_path):

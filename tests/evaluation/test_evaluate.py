@@ -77,10 +77,17 @@ def test_frames_that_are_not_finite_are_counted_and_left_out():
     (row,) = measure({"broken": broken}, [sequence()])
     assert row.finite_share == pytest.approx(23 / 24)
     assert row.rmse_vertices_mm < 1e-3
+    assert np.isnan(row.jitter) and np.isnan(row.acceleration_error), "not across the gap"
     lost = measure(
         {"nothing": lambda m, n: Answer(broken(m, n).positions * np.nan, 1.0)}, [sequence()]
     )
     assert lost[0].finite_share == 0.0 and np.isnan(lost[0].rmse_vertices_mm)
+
+
+def test_clips_too_short_to_jerk_have_a_table_too():
+    rows = measure({"lbs": skinning()}, [sequence(frames=3)])
+    assert rows[0].jitter_reference == 0.0
+    assert "| lbs | bottom | 0.0 |" in error_tables(rows)
 
 
 def test_cloth_that_came_off_is_no_reference():
@@ -136,6 +143,16 @@ def test_a_check_finds_explosions_wrong_counts_and_stretched_cloth():
     far = sequence(offset=(0.0, 0.9, 0.0))
     wrong = {f.quantity for f in check_sequence(far, 25) if not f.holds}
     assert {"frames missing", "largest offset, m"} <= wrong
+    short = sequence()
+    short.offsets["bottom"] = short.offsets["bottom"][:-2]
+    wrong = {f.quantity for f in check_sequence(short) if not f.holds}
+    assert wrong == {"frames unlike the motion's"}
+    still = sequence(frames=8)
+    pose = make_motion(*(np.tile(x[:1], (8, *[1] * (x.ndim - 1))) for x in (
+        np.asarray(still.motion.rotations), np.asarray(still.motion.root))), 30.0)  # fmt: skip
+    still = dataclasses.replace(still, motion=pose)
+    still.offsets["bottom"] += 1e-6 * np.sin(np.arange(8.0, dtype=np.float32))[:, None, None]
+    assert all(f.holds for f in check_sequence(still) if "inside" not in f.quantity)
     torn = sequence()
     torn.offsets["bottom"][:, ::2] += 0.05
     torn.offsets["bottom"][::2, 1::2] -= 0.05

@@ -68,6 +68,35 @@ def test_each_fault_is_counted_by_its_own_name():
     }
     for name, mesh in cases.items():
         assert getattr(mesh_health(mesh), name) > 0, name
+    # Of three faces at an edge two run in one sense whatever they do: that is no second fault.
+    assert mesh_health(cases["non_manifold_edges"]).inconsistent_edges == 0
+
+
+def test_vertices_in_one_place_are_welded_without_comparing_all_with_all():
+    x = np.concatenate([np.asarray(sheet().vertices), np.zeros((200_000, 3))])
+    crowd = make_mesh(x, np.asarray(sheet().faces))
+    assert mesh_health(crowd).coincident_vertices == 200_000
+    # Nearly in one place is another matter.
+    rng = np.random.default_rng(0)
+    x[25:] = 1e-6 * rng.normal(size=(200_000, 3))
+    with pytest.raises(MeshError, match="another unit"):
+        weld(make_mesh(x, np.asarray(sheet().faces)))
+
+
+def test_sheets_that_meet_in_one_edge_are_turned_each_by_itself():
+    ball = trimesh.creation.icosphere(2, 1.0)
+    body = make_mesh(ball.vertices, ball.faces)
+    # Three leaves on one common edge, just outside the sphere; the second is inside out.
+    a, b = np.array([0.0, 1.2, -0.3]), np.array([0.0, 1.2, 0.3])
+    tips = np.array([[0.5, 1.2, 0.0], [-0.5, 1.2, 0.0], [0.1, 1.7, 0.0]])
+    x = np.concatenate([[a, b], tips])
+    faces = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])
+    for senses in range(8):
+        told = np.array([f[::-1] if senses >> k & 1 else f for k, f in enumerate(faces)])
+        out = np.asarray(orient(make_mesh(x, told), body).faces)
+        corner = x[out]
+        normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+        assert (np.einsum("fi,fi->f", normal, corner.mean(axis=1))[:2] > 0).all()
 
 
 @settings(max_examples=20, deadline=None)

@@ -56,6 +56,21 @@ def test_degenerate_triangles_have_finite_value_and_gradient(corners):
     assert float(value) == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.parametrize("size", [1.0, 1e-3, 1e-5, 1e-8, 1e-12, 0.0])
+def test_gradients_by_the_corners_are_finite_however_small_the_triangle(size):
+    corners = jnp.asarray([[0, 0, 0], [size, 0, 0], [0, size, 0]], jnp.float32)
+
+    def distance(corners, p):
+        a, b, c = (x[:, None] for x in corners)
+        return closest_barycentric(p[:, None], a, b, c)[1][0]
+
+    for p in ([1.0, 0, 0], [1, 1, 1], [0.25 * size, 0.25 * size, 0.5], [-1, 0.3, 0]):
+        value, slope = jax.value_and_grad(distance)(corners, jnp.asarray(p, jnp.float32))
+        assert bool(jnp.isfinite(value)) and bool(jnp.isfinite(slope).all())
+        nearest = float(jnp.sum(jnp.asarray(p) ** 2)) ** 0.5
+        assert abs(float(value) ** 0.5 - nearest) <= 1.01 * size + 1e-6
+
+
 def test_signed_distance_of_a_sphere():
     s = trimesh.creation.icosphere(subdivisions=4)
     mesh = make_mesh(s.vertices, s.faces)

@@ -220,6 +220,62 @@ def test_a_usd_skin_is_baked(tmp_path):
     np.testing.assert_allclose(found.positions, expected, atol=1e-5)
 
 
+def test_a_long_cache_keeps_its_rate_and_all_its_frames(tmp_path):
+    sway = 0.1 * np.sin(0.3 * np.arange(151.0))[:, None, None] * POINTS[:, 1:2] * [1.0, 0.0, 0.5]
+    long = (POINTS + sway).astype(np.float32)
+    for fps in (30.0, 24.0, 30000.0 / 1001.0):
+        write_clip(tmp_path / "a.mdd", [AnimatedMesh("body", long, FACES)], fps)
+        again = read_character(tmp_path / "a_body.mdd", fps=fps)[0].positions
+        assert len(again) == 151
+        # As 32-bit times tell it: no frame is mixed from two.
+        np.testing.assert_allclose(again, long, atol=2e-6)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".npz", ".usdc"])
+def test_one_frame_is_a_person_who_stands_still(clip, tmp_path, suffix):
+    write_clip(tmp_path / f"a{suffix}", [AnimatedMesh("body", clip[:1], FACES)], 30.0)
+    mesh = read_character(tmp_path / f"a{suffix}")[0]
+    assert mesh.positions.shape[0] == 1
+    np.testing.assert_allclose(mesh.positions[:, mesh.faces], clip[:1, FACES], atol=1e-5)
+
+
+def test_a_stage_says_its_sense_and_may_be_silent_on_its_axis(clip, tmp_path):
+    write_clip(tmp_path / "a.usda", [AnimatedMesh("body", clip, FACES)], 30.0)
+    text = (tmp_path / "a.usda").read_text()
+    assert 'upAxis = "Y"' in text and 'orientation = "' not in text
+    left = text.replace("int[] faceVertexIndices", 'uniform token orientation = "leftHanded"\n'
+                        "        int[] faceVertexIndices")  # fmt: skip
+    (tmp_path / "b.usda").write_text(left)
+    mesh = read_character(tmp_path / "b.usda")[0]
+    np.testing.assert_array_equal(mesh.faces, FACES[:, ::-1])
+    # Z up, unsaid: found by how high the person is, as in files that can't say it.
+    from pxr import Usd, UsdGeom
+
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    stage.ClearMetadata("upAxis")
+    for prim in stage.Traverse():
+        if prim.IsA(UsdGeom.Mesh):
+            points = UsdGeom.Mesh(prim).GetPointsAttr()
+            for code in points.GetTimeSamples():
+                x = np.asarray(points.Get(code))[:, [0, 2, 1]] * np.float32([1.0, -1.0, 1.0])
+                points.Set([tuple(map(float, p)) for p in x], code)
+    stage.Export(str(tmp_path / "c.usda"))
+    mesh, _, notes = read_character(tmp_path / "c.usda")
+    assert "Z is up" in notes[0]
+    np.testing.assert_allclose(mesh.positions, clip, atol=1e-5)
+
+
+def test_limits_hold_for_all_meshes_together(clip, tmp_path, monkeypatch):
+    three = [AnimatedMesh(f"part{k}", clip, FACES) for k in range(3)]
+    for suffix, room in ((".glb", "_gltf_character"), (".usdc", "_usd_character")):
+        write_clip(tmp_path / f"a{suffix}", three, 30.0)
+        size = float(read_character(tmp_path / f"a{suffix}")[0].positions.size)
+        with monkeypatch.context() as less:
+            less.setattr(f"physxnet_jax.io.{room}._MOST", 0.9 * size)
+            with pytest.raises(FormatError, match=r"Cut the clip|changes its number"):
+                read_character(tmp_path / f"a{suffix}")
+
+
 def test_a_stage_reads_nothing_outside_its_folder(tmp_path, clip):
     (tmp_path / "in").mkdir()
     write_clip(tmp_path / "secret.usda", [AnimatedMesh("body", clip, FACES)], 30.0)
@@ -246,7 +302,10 @@ def test_a_small_file_does_not_take_much_memory(tmp_path):
     (tmp_path / "c.usda").write_text(
         "#usda 1.0\n(\n    startTimeCode = 0\n    endTimeCode = 900000\n)\n"
     )
-    for name in ("b.glb", "c.usda"):
+    # Two frames an hour apart.
+    still = np.zeros((2, 3000, 3), np.float32)
+    np.savez(tmp_path / "d.npz", positions=still, faces=FACES, fps=1e-4)
+    for name in ("b.glb", "c.usda", "d.npz"):
         tracemalloc.start()
         with pytest.raises(PhysXNetError, match=name):
             read_character(tmp_path / name)
@@ -270,6 +329,9 @@ def test_broken_files_are_refused_in_a_sentence(clip, tmp_path):
     refused("aren't finite", "d.npz", positions=clip * np.nan, faces=FACES)
     refused("no person's height", "e.npz", positions=clip * 7e5, faces=FACES)
     refused("'faces' beside it", "f.npz", positions=clip)
+    refused("with body 0 frames", "f0.npz", positions=clip[:0], faces=FACES)
+    parts = {"a_positions": clip, "b_positions": clip[:3], "a_faces": FACES, "b_faces": FACES}
+    refused("a 7, b 3 frames", "f1.npz", **parts)
     write_pc2(tmp_path / "g.pc2", clip)
     refused("put the OBJ", "g.pc2")
     write_obj(tmp_path / "g.obj", POINTS[:4], np.array([[0, 1, 2]]))
@@ -283,5 +345,5 @@ def test_broken_files_are_refused_in_a_sentence(clip, tmp_path):
         "<II", len(blob), 0x4E4F534A
     )
     (tmp_path / "i.glb").write_bytes(head + blob)
-    with pytest.raises(PhysXNetError, match="no animation"):
+    with pytest.raises(PhysXNetError, match="no mesh that moves"):
         read_character(tmp_path / "i.glb")

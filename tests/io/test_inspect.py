@@ -10,7 +10,7 @@ from physxnet_jax.cli import main
 from physxnet_jax.dressing import dress
 from physxnet_jax.errors import FormatError, MeshError
 from physxnet_jax.garment import template
-from physxnet_jax.io import fit_garment, inspect_garment, read_obj, write_obj
+from physxnet_jax.io import fit_garment, inspect_garment, load_garment, read_obj, write_obj
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +55,35 @@ def test_everything_at_once_is_found_and_mended(tmp_path, trousers):
     mended = read_obj(out)
     assert len(mended.vertices) == len(v)
     assert path.read_text() != out.read_text(), "the file itself isn't changed"
+
+
+def test_an_edge_of_three_faces_is_noted_and_does_not_stop_it_from_being_worn(tmp_path, trousers):
+    v, faces = trousers
+    out = v[faces[5, :1]] + [[0.0, 0.0, 0.0]]
+    fin = np.concatenate([v, out * [1.1, 1.0, 1.1]])
+    path = saved(tmp_path, "fin.obj", fin, np.concatenate([faces, [[*faces[5, :2], len(v)]]]))
+    found = inspect_garment(path)
+    assert not any("senses" in p for p in found.problems)
+    assert any("more than two faces" in n for n in found.notes)
+
+
+def test_a_vertex_that_no_face_uses_moves_with_the_skin(tmp_path, trousers):
+    v, faces = trousers
+    loose = np.concatenate([v, v[:1] + [[0.0, 0.0, 0.02]]])
+    garment, _ = load_garment(saved(tmp_path, "a.obj", loose, faces))
+    whole, _ = load_garment(saved(tmp_path, "b.obj", v, faces))
+    assert bool(garment.pinned[-1])
+    np.testing.assert_array_equal(garment.pinned[:-1], whole.pinned)
+
+
+def test_what_a_file_is_dressed_as_can_be_told(tmp_path):
+    g = template("dress")
+    path = saved(tmp_path, "coat.obj", np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces))
+    assert load_garment(path)[0].template == "dress"
+    coat, report = load_garment(f"{path}=top")
+    assert coat.template == report.template == "top" and coat.name == "coat"
+    with pytest.raises(MeshError, match=r"coat\.obj=hat"):
+        load_garment(f"{path}=hat")
 
 
 def test_what_is_worn_after_fitting_is_what_the_template_wears(tmp_path, trousers):

@@ -23,6 +23,7 @@ from physxnet_jax.io import (
     write_obj,
     write_pc2,
 )
+from physxnet_jax.models import ask_mirrored, fold_batch_norm
 
 QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
 
@@ -207,6 +208,12 @@ def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
     assert list_weights() == ["local", "local-muon", "nano", "pair", "paper", "small"]
     predictor = load_predictor("local")
     assert read_card("local")["model"]["inputs"]["family"] == "local"
+    for other, says in (
+        (fold_batch_norm(predictor), "folded"),
+        (ask_mirrored(predictor), "with \\+mirror"),
+    ):
+        with pytest.raises(WeightsError, match=says):
+            save_predictor(tmp_path / "w", other, name="copy")
     save_predictor(tmp_path / "w", predictor, name="copy")
     again = load_predictor(tmp_path / "w")
     import jax
@@ -225,8 +232,11 @@ def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
     (tmp_path / "w/card.json").write_text(json.dumps(card))
     with pytest.raises(WeightsError, match="atlas"):
         load_predictor(tmp_path / "w")
-    (tmp_path / "w/card.json").write_text("{")
-    with pytest.raises(WeightsError, match="damaged"):
-        load_predictor(tmp_path / "w")
+    for text in ("{", "[]"):
+        (tmp_path / "w/card.json").write_text(text)
+        with pytest.raises(WeightsError, match="damaged"):
+            load_predictor(tmp_path / "w")
+        with pytest.raises(WeightsError, match="not a card"):
+            read_card(tmp_path / "w")
     with pytest.raises(WeightsError, match="local"):
         load_predictor("second")

@@ -114,6 +114,8 @@ def test_a_small_bvh_is_read_exactly(tmp_path):
         (lambda s: s.replace("90 10", "nan 10"), 20, "not finite"),
         (lambda s: s.replace("90 10", "x 10"), 20, "not a number"),
         (lambda s: s.replace("CHANNELS 3", "CHANNELS 4"), 9, "CHANNELS says"),
+        (lambda s: s.replace("CHANNELS 3", "CHANNELS \u00b2"), 9, "CHANNELS says"),
+        (lambda s: s.replace("Frames: 2", "Frames: " + 5000 * "9"), 17, "number of frames"),
         (
             lambda s: s.replace(
                 "Zrotation Yrotation Xrotation\n    End", "Wrotation Yrotation Xrotation\n    End"
@@ -129,7 +131,7 @@ def test_a_small_bvh_is_read_exactly(tmp_path):
 )
 def test_broken_bvh_files_are_refused_naming_file_line_and_fix(tmp_path, change, line, says):
     path = tmp_path / "broken.bvh"
-    path.write_text(change(BVH))
+    path.write_text(change(BVH), encoding="utf-8")
     with pytest.raises(MotionError, match=says) as error:
         read_bvh(path)
     text = str(error.value)

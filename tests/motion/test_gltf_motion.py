@@ -298,6 +298,11 @@ def test_a_walk_in_amass_layout_is_the_same_walk(body, rest, tmp_path, layout, z
         ({"mocap_framerate": np.array(["x"])}, "mocap_framerate"),
         ({"poses": np.full((4, 156), "a")}, "poses are"),
         ({"poses": np.full((4, 156), None)}, "objects"),
+        (
+            {"poses": np.zeros((2_500_000, 66), np.int8), "trans": np.zeros((2_500_000, 3), "i1")},
+            "cut the clip",
+        ),
+        ({"mocap_framerate": 1e-9}, "true rate|mocap_framerate"),
     ],
 )
 def test_broken_amass_files_are_refused(tmp_path, change, says):
@@ -305,6 +310,6 @@ def test_broken_amass_files_are_refused(tmp_path, change, says):
     path = tmp_path / "clip.npz"
     np.savez(path, **(good | change), allow_pickle=True)
     with pytest.raises(MotionError, match=says):
-        load_motion(path)
+        load_motion(path, fps=30.0)
     np.savez(path, **good)
     assert load_motion(path).num_frames == 4

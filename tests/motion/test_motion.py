@@ -1,5 +1,7 @@
 """Interpolation in closed form, built-in clips, checks of arrays."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
@@ -110,6 +112,13 @@ def test_round_trip_through_npz(tmp_path):
     again = load_motion(tmp_path / "m.npz")
     np.testing.assert_array_equal(np.asarray(again.rotations), np.asarray(motion.rotations))
     assert again.fps == 30.0 and not list(tmp_path.glob("*.part"))
+
+
+def test_a_rate_that_would_fill_the_memory_is_refused():
+    slow = dataclasses.replace(turning(5, 30.0), fps=1e-8)
+    with pytest.raises(MotionError, match="true rate"):
+        resample(slow, 30.0)
+    assert load_motion("walk", fps=0.1).num_frames == 1
 
 
 @pytest.mark.parametrize(

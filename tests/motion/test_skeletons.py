@@ -14,6 +14,7 @@ from physxnet_jax.motion import (
     clip_transforms,
     find_joint_map,
     load_motion,
+    make_motion,
     procedural_clip,
     read_bvh,
     read_joint_map,
@@ -132,6 +133,29 @@ def test_a_skeleton_that_stands_along_z_is_turned_upright(body, rest, tmp_path):
     # Without the turn he would lie on his back.
     lying = read_bvh(path).positions()
     assert np.ptp(lying[0][:, 2]) > 2 * np.ptp(lying[0][:, 1])
+
+
+@pytest.mark.parametrize("angle", [180.0, 90.0, -90.0])
+@pytest.mark.parametrize("z_up", [False, True])
+def test_whichever_way_a_skeleton_faces_at_rest_its_walk_is_the_same(
+    body, rest, tmp_path, angle, z_up
+):
+    walk = procedural_clip("walk", fps=15.0)
+    turn = Rotation.from_euler("Y", angle, degrees=True)
+    stood = Rotation.from_euler("X", 90 if z_up else 0, degrees=True)
+    path = tmp_path / "a.bvh"
+    text = bvh(body, rest, walk, JOINT_MAPS["mixamo"], turn=(stood * turn).as_matrix())
+    path.write_text(text)
+    again = load_motion(path)
+    # It goes where the file's person goes: turned with the skeleton.
+    root = turn.apply(np.asarray(walk.root, np.float64))
+    np.testing.assert_allclose(again.root, root, atol=0.01)
+    first = np.asarray(again.rotations).copy()
+    hips = Rotation.from_quat(first[:, 0], scalar_first=True)
+    first[:, 0] = (turn.inv() * hips).as_quat(scalar_first=True)
+    back = make_motion(first, walk.root, again.fps)
+    limbs, turns = degrees(body, rest, walk, back)
+    assert limbs < 0.1 and turns < 3.0
 
 
 def test_joints_that_move_in_their_parents_are_followed(body, rest, tmp_path):

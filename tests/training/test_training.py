@@ -28,6 +28,8 @@ from physxnet_jax.training import (
     train,
 )
 from physxnet_jax.training._batches import MAX_OFFSET, load_frames
+from physxnet_jax.training._checkpoint import Checkpoints
+from physxnet_jax.training._step import TrainState
 from physxnet_jax.training._watch import Players, Validation
 
 CONFIG = TrainConfig(
@@ -135,6 +137,8 @@ def test_a_limb_out_of_its_sleeve_teaches_nothing_but_a_skirt_may_fly():
     flown = dataclasses.replace(data, offsets=far | skirt, meta=data.meta | {"dress": META})
     told = {t: teaches(flown, t) for t in flown.offsets}
     assert told == {"top": False, "bottom": False, "dress": True}
+    gone = dataclasses.replace(flown, offsets={"dress": 6 * skirt["dress"]})
+    assert not teaches(gone, "dress")
     assert all(teaches(data, t) for t in data.offsets), "near ones do"
 
 
@@ -180,7 +184,7 @@ def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):
     config = dataclasses.replace(config, learning_rate=0.3, adversarial=False, max_skipped=10**6)
     train(config, data, tmp_path)
     log = read_metrics(tmp_path)
-    assert json.loads((tmp_path / "config.json").read_text())["data"] == "a 20"
+    assert json.loads((tmp_path / "config.json").read_text())["data"].startswith("a 20 ")
     measured = [x["validation_mm"] for x in log if "validation_mm" in x]
     best = int(np.argmin(measured))
     assert len(measured) - 1 - best == 2, "two without a better one, then it stopped"
@@ -204,7 +208,8 @@ def test_mirrored_actions_are_learned_from_too(tmp_path):
     seen = []
     train(config, data, tmp_path, report=lambda done, total, _: seen.append((done, total)))
     # Twice twenty frames, and nothing of what is kept for measuring.
-    assert json.loads((tmp_path / "config.json").read_text())["data"] == "a 20, a 20"
+    told = json.loads((tmp_path / "config.json").read_text())["data"].split(", ")
+    assert [t.rsplit(" ", 1)[0] for t in told] == ["a 20", "a 20"] and told[0] != told[1]
     assert seen[-1] == (10, 10)
     losses = [x["l2"] for x in read_metrics(tmp_path) if "loss" in x]
     assert losses and all(0.0 < x < 1.0 for x in losses)
@@ -220,6 +225,51 @@ def test_lines_of_steps_that_will_be_done_again_do_not_count(tmp_path):
     assert watch.best == 2.0 and not watch.exhausted
     assert [watch.update(2.5), watch.update(2.1)] == [False, False] and watch.exhausted
     assert watch.update(1.9) and not watch.exhausted
+
+
+def test_what_was_done_again_counts_once_and_nothing_that_is_no_number_is_best():
+    told = ((4, 3.0), (8, 2.0), (12, 2.5), (8, 2.0), (12, 2.5))
+    lines = [{"step": s, "validation_mm": v} for s, v in told]
+    assert not Validation(lines, 12, 2).exhausted, "one without a better one, told twice"
+    watch = Validation([], 0, 3)
+    assert watch.update(5.0) and not watch.update(float("nan"))
+    assert watch.best == 5.0 and watch.update(4.0)
+
+
+def test_a_run_that_is_stopped_on_the_way_ends_as_the_whole_one(tmp_path):
+    model = dataclasses.replace(CONFIG.model, templates=("bottom",))
+    config = dataclasses.replace(
+        CONFIG, model=model, validation=("b",), validate_every=4, epochs=2, adversarial=False
+    )
+    data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
+    train(config, data, tmp_path / "whole")
+    train(config, data, tmp_path / "parts", steps=3)
+    with (tmp_path / "parts/metrics.jsonl").open("a") as log:
+        log.write('{"step": 4, "lo')
+    train(config, data, tmp_path / "parts")
+    logs = [read_metrics(tmp_path / n) for n in ("whole", "parts")]
+    validated = [
+        [(x["step"], x["validation_mm"]) for x in log if "validation_mm" in x] for log in logs
+    ]
+    assert [s for s, _ in validated[0]] == [4, 8, 10]
+    assert validated[1] == validated[0], "no more often, and the line after the cut one is there"
+    # Other cloth of the same names is another run.
+    other = [data[1], dataclasses.replace(sequence(seed=2), name="a")]
+    with pytest.raises(PhysXNetError, match="another data"):
+        train(config, other, tmp_path / "parts")
+
+
+def test_states_of_steps_to_be_done_again_are_forgotten(tmp_path):
+    state = TrainState(*(jnp.zeros(()) for _ in dataclasses.fields(TrainState)))
+    at = lambda n: dataclasses.replace(state, step=jnp.int32(n))  # noqa: E731
+    kept = Checkpoints(tmp_path / "best", keep=1)
+    kept.save(at(8), {})
+    with pytest.raises(PhysXNetError, match="step 4 wasn't saved"):
+        kept.save(at(4), {})
+    kept.forget_after(4)
+    kept.save(at(4), {})
+    assert int(kept.latest(at(0)).step) == 4
+    kept.close()
 
 
 def test_a_discriminator_that_wins_or_guesses_raises_the_alarm():

@@ -12,6 +12,7 @@ from ..dressing import (
     load_ladder,
     pick_rung,
 )
+from ..errors import PhysXNetError
 from ..garment import TEMPLATES
 from ..io import load_garment
 from ._commands import Calibrate, Dress
@@ -44,6 +45,9 @@ def choose(command: Dress, progress: Callable[[str, int, int], None]) -> Choice 
     """The rung for a time or an error that was asked for; None if neither was."""
     if command.budget_ms is None and command.max_error_mm is None:
         return None
+    # Before minutes are spent on timing.
+    if command.budget_ms is not None and command.max_error_mm is not None:
+        raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
     ladder = load_ladder()
     templates = [load_garment(g)[0].template for g in command.wear]
     times = measure(ladder, report=lambda _, k, n: progress("timing", k, n))

@@ -22,8 +22,8 @@ class Dress:
     motion: tyro.conf.Positional[str]
     """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
     wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and OBJ files: tops over dresses over trousers, of two of one
-    kind the second over the first."""
+    """Templates (top, bottom, dress) and OBJ files (coat.obj=top says what one is dressed as): tops
+    over dresses over trousers, of two of one kind the second over the first."""
     own_body: bool = False
     """The file is a person of your own to be dressed: .glb, .usd, .pc2, .mdd (with OBJ), .npz."""
     body_mesh: str | None = None
@@ -111,6 +111,30 @@ class Fit:
 
 
 @dataclasses.dataclass(frozen=True)
+class Rest:
+    """Write the body at rest, and templates on it, as OBJ: to model garments on.
+
+    Metres, Y up, origin in the pelvis, arms 45 degrees down. A garment modelled on the
+    default shape follows the others; --shape shows what they look like.
+
+    Examples:
+      physxnet rest -o rest
+      physxnet rest --wear top dress -o rest
+    """
+
+    out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for body.obj and a file for each template."""
+    wear: tuple[Literal["top", "bottom", "dress"], ...] = ("top", "bottom", "dress")
+    """Templates to write beside it, as a body of that shape wears them."""
+    shape: tuple[str, ...] = ()
+    """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
+    quiet: bool = False
+    """Print nothing but errors."""
+    debug: bool = False
+    """Show the trace of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Demo:
     """Dress a built-in walk: writes demo.usdc, demo.mp4 and demo.png."""
 
@@ -177,7 +201,7 @@ class Simulate:
     scene: tyro.conf.Positional[str]
     """A scene file (.toml), a motion file, or a built-in clip."""
     wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and OBJ files; not with a scene file."""
+    """Templates (top, bottom, dress) and OBJ files; a scene file names its own."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Result: .usdc, .usd, .usda, .pc2, .mdd (with OBJ), .glb, .html, .obj (one a frame), .npz."""
     preview: pathlib.Path | None = None
@@ -192,6 +216,10 @@ class Simulate:
     """Garments collide with themselves."""
     fps: float = 30.0
     """Frames a second."""
+    source_fps: float | None = None
+    """True rate of the motion file, where its header is wrong or silent."""
+    skeleton: pathlib.Path | None = None
+    """The ASF of an AMC file, if it doesn't lie beside it."""
     joint_map: pathlib.Path | None = None
     """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
     frames: int | None = None
@@ -221,9 +249,15 @@ class Effects:
     scene: tyro.conf.Positional[str]
     """A scene file (.toml), a motion file, or a built-in clip."""
     wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and OBJ files; not with a scene file."""
+    """Templates (top, bottom, dress) and OBJ files; a scene file names its own."""
     frames: int | None = 20
     """Frames that are simulated."""
+    source_fps: float | None = None
+    """True rate of the motion file, where its header is wrong or silent."""
+    skeleton: pathlib.Path | None = None
+    """The ASF of an AMC file, if it doesn't lie beside it."""
+    joint_map: pathlib.Path | None = None
+    """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
     recommend: bool = False
     """Say which effects matter, those that the scene doesn't have included."""
     tolerance: float = 2.0
@@ -263,6 +297,10 @@ class View:
     """Frames at most."""
     fps: float = 30.0
     """Frames a second."""
+    source_fps: float | None = None
+    """True rate of the motion file, where its header is wrong or silent."""
+    skeleton: pathlib.Path | None = None
+    """The ASF of an AMC file, if it doesn't lie beside it."""
     joint_map: pathlib.Path | None = None
     """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
     html: pathlib.Path | None = None

@@ -29,6 +29,9 @@ def doctor(console: Console, *, json: bool = False) -> int:
     rows += [(name, _version(name) or "[red]missing[/red]") for name in _REQUIRED]
     rows += [(n, _version(n) or f"not installed (extra {use})") for n, use in _OPTIONAL.items()]
     problem = jaxlib_problem(_version("jaxlib") or "", os.environ.get("XLA_FLAGS", ""))
+    missing = [name for name in _REQUIRED if _version(name) is None]
+    if missing:
+        problem = f"{', '.join(missing)} missing. Install: pip install {' '.join(missing)}."
     if problem is None:
         import jax
 

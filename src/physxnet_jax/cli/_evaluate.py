@@ -4,12 +4,12 @@ import collections
 import dataclasses
 import json
 import pathlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence as Items
 
 from rich.console import Console
 from rich.table import Table
 
-from ..data import list_sequences, read_sequence
+from ..data import Sequence, list_sequences, read_sequence
 from ..dressing import method_by_name, weights_folder
 from ..errors import FormatError, PhysXNetError
 from ..evaluation import (
@@ -27,6 +27,7 @@ from ..evaluation import (
 from ..files import whole_file
 from ..io import load_predictor
 from ..simulation import ACCURACY
+from ..training import usable_garment
 from ..viewer import draw_bars
 from ._experiment_commands import Evaluate
 from ._progress import progress_bars
@@ -45,7 +46,13 @@ def evaluate(command: Evaluate, console: Console) -> int:
     rows = _read(command.out)
     sequences = [read_sequence(f) for f in folders]
     with progress_bars(console) as progress:
-        methods = {_label(name): _method(name, command, progress) for name in command.methods}
+        # What has all its rows needn't be at hand.
+        wanted = [
+            name
+            for name in command.methods
+            if command.times or not _measured(_label(name), sequences, command, rows)
+        ]
+        methods = {_label(name): _method(name, command, progress) for name in wanted}
 
         def show(_: str, k: int, n: int) -> None:
             progress("rows", k, n)
@@ -78,6 +85,19 @@ def evaluate(command: Evaluate, console: Console) -> int:
             )
         console.print(f"wrote {command.out}, .md and two charts", highlight=False)
     return 0
+
+
+def _measured(
+    label: str, sequences: Items[Sequence], command: Evaluate, rows: Items[ActionError]
+) -> bool:
+    """Whether every row that a method could have is there."""
+    known = {(r.engine, r.action, r.template) for r in rows if r.method == label}
+    return all(
+        (s.meta[t]["engine"], s.name, t) in known
+        for s in sequences
+        for t in command.templates
+        if t in s.offsets and usable_garment(s.meta[t])
+    )
 
 
 def _panel(row: ActionError) -> str:

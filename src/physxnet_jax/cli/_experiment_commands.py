@@ -98,7 +98,8 @@ class Dataset:
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """build: the dataset's folder."""
     mocap: pathlib.Path | None = None
-    """Where ACTIONS.csv and the motion files lie; mocap in $PHYSXNET_DATA or ../shared."""
+    """Where ACTIONS.csv and the motion files lie; mocap in $PHYSXNET_DATA or ../shared.
+    docs/protocol.md tells what is in it."""
     shard: str = "0/1"
     """build: i/n, every n-th action from the i-th."""
     only: tuple[str, ...] = ()

@@ -19,5 +19,8 @@ def export(command: Export, console: Console) -> int:
         )
     for file in files:
         console.print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)", highlight=False)
-    console.print("use: from dress import load; cloth = load(FOLDER)(rotations, root)")
+    console.print(
+        f"use, in {command.out}: from dress import load; cloth, ok = load('.')(rotations, root)",
+        highlight=False,
+    )
     return 0

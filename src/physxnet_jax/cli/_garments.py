@@ -4,11 +4,15 @@ import dataclasses
 import math
 from typing import Any
 
+import numpy as np
+from jaxtyping import Array, Float
 from rich.console import Console
 from rich.table import Table
 
-from ..io import Inspection, fit_garment, inspect_garment
-from ._commands import Fit, Inspect
+from ..body import load_body
+from ..garment import template
+from ..io import Inspection, fit_garment, inspect_garment, write_obj
+from ._commands import Fit, Inspect, Rest
 from ._progress import print_json
 
 
@@ -42,6 +46,23 @@ def fit(command: Fit, console: Console) -> int:
     _show(result, console)
     console.print(f"wrote {command.out}", highlight=False)
     return int(bool(result.problems))
+
+
+def rest(command: Rest, shape: Float[Array, " shapes"], console: Console) -> int:
+    """Writes the body of that shape, and templates as it wears them, at rest."""
+    body = load_body()
+    meshes = {"body": body.rest_mesh(shape)}
+    for name in command.wear:
+        garment = template(name)
+        meshes[name] = garment.mesh.replace(
+            vertices=garment.rest_vertices(body.rest_vertices(shape))
+        )
+    for name, mesh in meshes.items():
+        path = command.out / f"{name}.obj"
+        chart = (None if x is None else np.asarray(x) for x in (mesh.uv, mesh.uv_faces))
+        write_obj(path, np.asarray(mesh.vertices), np.asarray(mesh.faces), *chart)
+        console.print(f"wrote {path}", highlight=False)
+    return 0
 
 
 def _show(found: Inspection, console: Console) -> None:

@@ -19,6 +19,7 @@ from ._commands import (
     Export,
     Fit,
     Inspect,
+    Rest,
     Simulate,
     View,
 )
@@ -42,6 +43,7 @@ _Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Inspect, tyro.conf.subcommand("inspect")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Rest, tyro.conf.subcommand("rest")]
     | Annotated[View, tyro.conf.subcommand("view")]
 )
 
@@ -102,6 +104,7 @@ def _run(
     | Calibrate
     | Inspect
     | Fit
+    | Rest
     | View,
     console: Console,
 ) -> int:
@@ -121,6 +124,12 @@ def _run(
         if isinstance(command, Inspect):
             return inspect(command, console)
         return fit(command, Console(quiet=True) if command.quiet else console)
+    if isinstance(command, Rest):
+        from ..body import load_body
+        from ._garments import rest
+
+        shape = load_body().shape(**_parse_shape(command.shape))
+        return rest(command, shape, Console(quiet=True) if command.quiet else console)
     if isinstance(command, View):
         from ._view import view
 

@@ -45,17 +45,14 @@ def simulate(command: Simulate, console: Console) -> int:
     if command.self_contact:
         also.append(SelfContact())
     if _is_scene(command.scene):
-        job = load_scene(command.scene)
-        if command.fabric is not None or also:
-            raise FormatError(
-                f"{command.scene}: a scene file names its fabrics and effects itself; leave"
-                " --fabric, --wind and --self-contact out."
-            )
+        job = _scene_file(command)
     else:
         job = make_scene(
             command.scene,
             command.wear,
             fps=command.fps,
+            source_fps=command.source_fps,
+            skeleton=command.skeleton,
             joint_map=command.joint_map,
             frames=command.frames,
             fabric=command.fabric,
@@ -119,6 +116,36 @@ def _is_scene(word: str) -> bool:
     return pathlib.Path(word).suffix.lower() == ".toml"
 
 
+# What a scene file tells itself, by the command's names.
+_TOLD = ("wear", "fabric", "wind", "self_contact", "fps", "source_fps", "skeleton", "joint_map")
+
+
+def _scene_file(command: Simulate | Effects) -> SceneFile:
+    """The scene of a file, with as many frames as are asked for.
+
+    Raises:
+        FormatError: The command says what the file has to say.
+    """
+    ordinary = {f.name: f.default for f in dataclasses.fields(command)}
+    for name in _TOLD:
+        if name in ordinary and getattr(command, name) != ordinary[name]:
+            raise FormatError(
+                f"{command.scene}: a scene file tells its garments, fabrics, effects and motion"
+                f" itself; write it there and leave --{name.replace('_', '-')} out."
+            )
+    job = load_scene(command.scene)
+    if command.frames is None:
+        return job
+    if command.frames < 1:
+        raise FormatError(f"frames is {command.frames}; ask for at least one.")
+    motion = dataclasses.replace(
+        job.motion,
+        rotations=job.motion.rotations[: command.frames],
+        root=job.motion.root[: command.frames],
+    )
+    return dataclasses.replace(job, motion=motion)
+
+
 _SHOWN = {
     "strain_p99": ("strain, 99th percentile (%)", 100.0),
     "strain_max": ("strain, worst edge (%)", 100.0),
@@ -152,16 +179,16 @@ def _summary(rollout: Rollout, effects: tuple[Effect, ...], took: float) -> Tabl
 def price(command: Effects, console: Console) -> int:
     """Prints the price list of a scene's effects, or what is recommended."""
     if _is_scene(command.scene):
-        job = load_scene(command.scene)
-        if command.frames is not None:
-            motion = dataclasses.replace(
-                job.motion,
-                rotations=job.motion.rotations[: command.frames],
-                root=job.motion.root[: command.frames],
-            )
-            job = SceneFile(job.scene, motion, job.accuracy)
+        job = _scene_file(command)
     else:
-        job = make_scene(command.scene, command.wear, frames=command.frames)
+        job = make_scene(
+            command.scene,
+            command.wear,
+            source_fps=command.source_fps,
+            skeleton=command.skeleton,
+            joint_map=command.joint_map,
+            frames=command.frames,
+        )
     solver = ACCURACY[job.accuracy].at_rate(job.motion.fps)
     with progress_bars(console) as bars:
         rows = price_effects(

@@ -27,6 +27,8 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         compare=command.compare,
         frames=command.frames,
         fps=command.fps,
+        source_fps=command.source_fps,
+        skeleton=command.skeleton,
         joint_map=command.joint_map,
     )
     if command.html is not None:

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import itertools
 import pathlib
 import re
 
@@ -13,6 +14,10 @@ from ..motion import Motion, load_motion, sample
 FPS = 30.0
 # Frames of what is left of a clip: two seconds at least, about as much as two actions at most.
 _SHORTEST, _LONGEST = 60, 400
+_HOW = (
+    "Name the folder that holds it and the motion files (--mocap); docs/protocol.md tells its"
+    " columns"
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,14 +58,14 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
     folder = pathlib.Path(folder)
     table = folder / "ACTIONS.csv"
     if not table.is_file():
-        raise MotionError.at(table, None, "no such file", "Name the folder that holds ACTIONS.csv")
+        raise MotionError.at(table, None, "no such file", _HOW)
     rates: dict[str, float] = {}
     clips = folder / "CLIPS.csv"
     if clips.is_file():
         with clips.open(newline="") as file:
             rates = {row["file"]: float(row["fps"]) for row in csv.DictReader(file)}
     with table.open(newline="") as file:
-        return [
+        actions = [
             Action(
                 row["split"],
                 row["action"],
@@ -71,6 +76,18 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
             )
             for row in csv.DictReader(file)
         ]
+    seen: dict[str, str] = {}
+    for action in actions:
+        if not action.slug or action.slug in seen:
+            other = f"'{seen[action.slug]}' beside it" if action.slug else "letters a to z"
+            raise MotionError.at(
+                table,
+                None,
+                f"the action '{action.name}' has no folder of its own, for {other}",
+                "Give each another name, of letters and digits",
+            )
+        seen[action.slug] = action.name
+    return actions
 
 
 def left_out(folder: str | pathlib.Path, actions: list[Action]) -> list[Action]:
@@ -96,7 +113,7 @@ def left_out(folder: str | pathlib.Path, actions: list[Action]) -> list[Action]:
         clip = load_motion(folder / action.file, source_fps=action.fps)
         spans = sorted((a.start, a.start + a.frames / FPS) for a in same)
         # The first frame of many clips is a calibration pose.
-        begins = [3.0 / FPS, *(end for _, end in spans)]
+        begins = [3.0 / FPS, *itertools.accumulate((end for _, end in spans), max)]
         ends = [*(begin for begin, _ in spans), (clip.num_frames - 1) / clip.fps]
         begin, end = max(zip(begins, ends), key=lambda gap: gap[1] - gap[0])
         frames = min(int((end - begin) * FPS), _LONGEST)

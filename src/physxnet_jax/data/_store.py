@@ -213,9 +213,23 @@ def is_stored(folder: pathlib.Path, template: str) -> bool:
 
 
 def write_action(folder: pathlib.Path, motion: Motion, split: str) -> None:
-    """The motion of an action and what split it is in."""
+    """The motion of an action and what split it is in.
+
+    Raises:
+        FormatError: Another motion lies there: its garments belong to that one.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    save_motion(folder / "motion.npz", motion)
+    there = folder / "motion.npz"
+    if there.is_file():
+        before = load_motion(there)
+        pairs = ((before.rotations, motion.rotations), (before.root, motion.root))
+        if not all(a.shape == b.shape and np.allclose(a, b, atol=1e-4) for a, b in pairs):
+            raise FormatError(
+                f"{folder}: its motion isn't the one that is simulated now, by other files or"
+                " another version. Delete that folder, or build into another one."
+            )
+    else:
+        save_motion(there, motion)
     with whole_file(folder / "action.json") as part:
         part.write_text(json.dumps({"name": motion.name, "split": split}))
 
@@ -232,7 +246,8 @@ def read_sequence(folder: str | pathlib.Path) -> Sequence:
         raise FormatError(f"{folder}: no action.json, not an action of a dataset.")
     info = json.loads(note.read_text())
     motion = load_motion(folder / "motion.npz")
-    found = sorted(p.parent.name for p in folder.glob("*/zarr.json"))
+    # What begins with a dot is being written, or was when its process was killed.
+    found = sorted(p.parent.name for p in folder.glob("[!.]*/zarr.json"))
     return Sequence(
         info["name"],
         info["split"],
@@ -263,11 +278,16 @@ def read_log(root: str | pathlib.Path) -> list[dict[str, Any]]:
     return [json.loads(x) for x in path.read_text().splitlines()] if path.is_file() else []
 
 
+def _unfinished(path: pathlib.Path) -> bool:
+    return any(part.startswith(".") for part in path.parts)
+
+
 def dataset_digest(root: str | pathlib.Path) -> tuple[str, int]:
     """Checksum of all that a dataset is (times apart), and its bytes."""
     root = pathlib.Path(root)
     total, size = hashlib.sha256(), 0
-    for path in sorted(p for p in root.rglob("*") if p.is_file() and p.name != _LOG):
+    files = (p for p in root.rglob("*") if p.is_file() and p.name != _LOG)
+    for path in sorted(p for p in files if not _unfinished(p.relative_to(root))):
         blob = path.read_bytes()
         size += len(blob)
         total.update(f"{path.relative_to(root)} {hashlib.sha256(blob).hexdigest()}\n".encode())

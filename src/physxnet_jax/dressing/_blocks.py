@@ -68,7 +68,8 @@ def predict_clip(
     resolve: bool,
     stages: list[Stage],
     progress: Callable[[str, int, int], None] | None,
-) -> dict[str, Any]:
+) -> tuple[dict[str, np.ndarray], dict[str, float]]:
+    """Positions of each garment [m], and the share of its vertices inside before push-out."""
     lead = lead_frames(predictor)
     name = "network" if predictor is not None else "skinning"
     frames = len(world)
@@ -91,13 +92,11 @@ def predict_clip(
             progress(name, min(start + BLOCK, frames), frames)
     warm = float(np.median(times[1:])) / BLOCK if len(times) > 1 else None
     stages.append(Stage(name, times[0], warm))
-    result: dict[str, Any] = {"inside_raw": {}}
+    positions, inside = {}, {}
     for k, w in enumerate(wearables):
-        result[w.name] = np.concatenate([b[k][0] for b in blocks])[:frames]
-        result["inside_raw"][w.name] = float(
-            np.concatenate([b[k][1] for b in blocks])[:frames].mean()
-        )
-    return result
+        positions[w.name] = np.concatenate([b[k][0] for b in blocks])[:frames]
+        inside[w.name] = float(np.concatenate([b[k][1] for b in blocks])[:frames].mean())
+    return positions, inside
 
 
 def simulate_clip(

@@ -54,7 +54,8 @@ class DressedClip:
         fallbacks: For each garment, vertices bound by the closest point; likewise.
         inside_raw: For each garment, share of vertices below the skin near them, as
             computed. Another limb's skin isn't looked at.
-        inside: The same in the result, after the push-out.
+        inside: The same in the result, after the push-out; for a `Character` against the
+            person's own surface, from which cloth is then moved.
         method: How the cloth was made.
         notes: What the reader should know about it.
     """
@@ -161,6 +162,8 @@ def dress(
         )
         if person is not None:
             garments = [on_character(g, person) for g in garments]
+        else:
+            garments = [as_on(body, g) for g in garments]
     hits: dict[str, float | None] = {g.name: None for g in garments}
     fallbacks: dict[str, int | None] = {g.name: None for g in garments}
     predictor = None
@@ -182,11 +185,11 @@ def dress(
     layers = make_layers(body, rest, wearables, garments)
     if method == "simulate":
         positions = simulate_clip(garments, clip, body, shape, accuracy, stages, progress)
+        inside_raw = None
     else:
-        positions = predict_clip(
+        positions, inside_raw = predict_clip(
             predictor, wearables, patches, layers, world, shift, clip.fps, resolve, stages, progress
         )
-    inside_raw: Any = positions.pop("inside_raw", None)
     inside = {
         w.name: inside_share(p, positions[w.name], world, shift)
         for w, p in zip(wearables, patches, strict=True)
@@ -222,11 +225,29 @@ def dress(
 def fit_surface(
     predictor: Predictor, body: Body, rest: Float[Array, "all 3"], shape: Any | None
 ) -> Predictor:
-    """The predictor with its texels on a body of another shape."""
+    """The predictor with its texels on a body of another shape.
+
+    Args:
+        predictor: Of the built-in body's default shape.
+        body: The body.
+        rest: `Body.rest_vertices` of the shape [m].
+        shape: Its parameters, None for the default shape.
+    """
     if shape is None and body is load_body():
         return predictor
     surface = make_surface(predictor.atlas, body, rest, predictor.surface.valid)
     return dataclasses.replace(predictor, surface=surface)
+
+
+def as_on(body: Body, garment: Garment) -> Garment:
+    """A garment with its mesh where it lies on this body at rest.
+
+    Templates come on the built-in one, whatever body they are carried by.
+    """
+    if body is load_body():
+        return garment
+    vertices = garment.rest_vertices(body.rest_vertices(body.default_shape()))
+    return dataclasses.replace(garment, mesh=garment.mesh.replace(vertices=vertices))
 
 
 def bound_wearable(

@@ -24,7 +24,7 @@ from ..models import (
     stream_frame,
 )
 from ..typing import pytree
-from ._dress import bound_wearable, fit_surface
+from ._dress import as_on, bound_wearable, fit_surface
 from ._layers import Layer, lift_layers, lift_off, make_layers
 from ._meshes import with_names
 from ._push_out import SkinPatch, each_frame, make_patch, push_out, tuck_in
@@ -112,6 +112,7 @@ def make_dresser(
     garments = with_names(
         [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
     )
+    garments = [as_on(body, g) for g in garments]
     predictor = weights if isinstance(weights, Predictor) else load_predictor(weights)
     predictor = at_precision(fit_surface(predictor, body, rest, shape), precision)
     wearables = tuple(bound_wearable(predictor, body, rest, g) for g in garments)

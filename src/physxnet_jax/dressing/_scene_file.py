@@ -12,13 +12,15 @@ from ..body import load_body
 from ..errors import FormatError
 from ..garment import FABRICS, Garment
 from ..io import load_garment
-from ..motion import Motion, load_motion
+from ..motion import Motion, load_motion, make_motion, resample
 from ..simulation import ACCURACY, EFFECTS, Effect, Scene, standard_effects
 from ._layers import inside_out
 from ._meshes import with_names
 
 _KEYS: dict[str, type | tuple[type, ...]] = {
     "motion": str,
+    "source_fps": (int, float),
+    "skeleton": str,
     "joint_map": str,
     "fps": (int, float),
     "frames": int,
@@ -49,7 +51,9 @@ def make_scene(
     motion: str | pathlib.Path | Motion,
     wear: Sequence[str | pathlib.Path | Garment] = ("top", "bottom"),
     *,
-    fps: float = 30.0,
+    fps: float | None = None,
+    source_fps: float | None = None,
+    skeleton: str | pathlib.Path | None = None,
     joint_map: str | pathlib.Path | None = None,
     frames: int | None = None,
     accuracy: str = "standard",
@@ -63,7 +67,9 @@ def make_scene(
     Args:
         motion: A motion, a motion file, or the name of a built-in clip.
         wear: Garments, OBJ files or template names; put into the order of layers.
-        fps: Frames a second.
+        fps: Frames a second; a `Motion`'s own if omitted, else 30.
+        source_fps: True rate of a motion file [1/s], where its header is wrong or silent.
+        skeleton: The ASF of an AMC file, if it doesn't lie beside it.
         joint_map: File of joint names, for a motion file of unknown ones.
         frames: Keep only this many frames.
         accuracy: ``draft``, ``standard`` or ``fine``.
@@ -81,9 +87,18 @@ def make_scene(
         raise FormatError(f"No fabric '{fabric}'; there are {', '.join(FABRICS)}.")
     body = load_body()
     if isinstance(motion, Motion):
-        clip = motion
+        clip = make_motion(motion.rotations, motion.root, motion.fps, name=motion.name)
+        clip = clip if fps in (None, clip.fps) else resample(clip, fps)
     else:
-        clip = load_motion(motion, fps=fps, joint_map=joint_map, body=body, shape=shape)
+        clip = load_motion(
+            motion,
+            fps=30.0 if fps is None else fps,
+            source_fps=source_fps,
+            skeleton=skeleton,
+            joint_map=joint_map,
+            body=body,
+            shape=shape,
+        )
     if frames is not None:
         if frames < 1:
             raise FormatError(f"frames is {frames}; ask for at least one.")
@@ -104,6 +119,8 @@ def load_scene(path: str | pathlib.Path) -> SceneFile:
     ::
 
         motion = "walk"            # a built-in clip or a motion file
+        source_fps = 120           # where the file's header is wrong or silent
+        skeleton = "02.asf"        # of an AMC file, if it doesn't lie beside it
         joint_map = "names.toml"   # only for a file of unknown joint names
         garments = ["bottom", "top"]
         frames = 60
@@ -136,8 +153,9 @@ def load_scene(path: str | pathlib.Path) -> SceneFile:
     wrong = [k for k, v in text.get("shape", {}).items() if not isinstance(v, int | float)]
     if wrong:
         raise FormatError(f"{path}: shape {wrong[0]} isn't a number.")
-    if not 0 < float(text.get("fps", 30.0)) <= 1e4:
-        raise FormatError(f"{path}: fps is {text['fps']}, expected a positive number.")
+    for key in ("fps", "source_fps"):
+        if not 0 < float(text.get(key, 30.0)) <= 1e4:
+            raise FormatError(f"{path}: {key} is {text[key]}, expected a positive number.")
     words = [
         {"file": g} if isinstance(g, str) else g for g in text.get("garments", ["top", "bottom"])
     ]
@@ -162,6 +180,8 @@ def load_scene(path: str | pathlib.Path) -> SceneFile:
         _beside(path, text["motion"]),
         garments,
         fps=float(text.get("fps", 30.0)),
+        source_fps=text.get("source_fps"),
+        skeleton=_beside(path, text["skeleton"]) if "skeleton" in text else None,
         joint_map=_beside(path, text["joint_map"]) if "joint_map" in text else None,
         frames=text.get("frames"),
         accuracy=text.get("accuracy", "standard"),
@@ -173,7 +193,9 @@ def load_scene(path: str | pathlib.Path) -> SceneFile:
 
 def _beside(path: pathlib.Path, word: str) -> str | pathlib.Path:
     there = path.parent / word
-    return there if there.is_file() else word
+    # A garment may have "=top" behind it.
+    files = (there, path.parent / word.rpartition("=")[0])
+    return there if any(f.is_file() for f in files) else word
 
 
 def _effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:

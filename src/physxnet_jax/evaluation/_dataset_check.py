@@ -21,6 +21,8 @@ _INSIDE = 0.02
 _STRAIN = 0.4
 # Jerk of the cloth over that of its skinning [1].
 _JITTER = 10.0
+# Jerk of a person who stands still, or less [m/s^3]: cloth on one needn't be stiller.
+_STILL = 1.0
 _EVERY = 10
 
 
@@ -47,6 +49,9 @@ def check_sequence(sequence: Sequence, frames: int | None = None) -> list[Findin
         find(name, "largest offset, m", _FAR, np.linalg.norm(offsets, axis=2).max())
         if offsets.shape[1] != template(name).num_vertices:
             continue
+        find(name, "frames unlike the motion's", 0.0, abs(len(offsets) - motion.num_frames))
+        if len(offsets) != motion.num_frames:
+            continue
         scene = prepare_scene(Scene((template(name),)))
         skinned = skinning()(motion, name).positions
         cloth = skinned + offsets
@@ -55,6 +60,6 @@ def check_sequence(sequence: Sequence, frames: int | None = None) -> list[Findin
         find(name, "inside the body, share", _INSIDE, (seen.cloth_inside & ~seen.pinched).mean())
         strain = np.abs(edge_strain(scene.assembly, cloth))
         find(name, "strain, 99 %", _STRAIN, np.quantile(strain, 0.99))
-        still = max(jitter(skinned, motion.fps), 1e-6)
+        still = max(jitter(skinned, motion.fps), _STILL)
         find(name, "jerk over that of skinning", _JITTER, jitter(cloth, motion.fps) / still)
     return out

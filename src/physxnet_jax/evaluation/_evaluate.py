@@ -212,9 +212,13 @@ class _Reference:
                 np.quantile(np.abs(area_strain(assembly.rest, faces, x)), 0.99)
             ),
             "wrinkle_deg": wrinkle_error(faces, x, y),
-            "acceleration_error": acceleration_error(x, y, motion.fps),
-            "jitter": jitter(x, motion.fps),
         }
+        # Across a frame that is missing there is no acceleration.
+        if finite.all():
+            values |= {
+                "acceleration_error": acceleration_error(x, y, motion.fps),
+                "jitter": jitter(x, motion.fps),
+            }
         return ActionError(**values)
 
 

@@ -1,5 +1,6 @@
 """Tables of errors as Markdown."""
 
+import math
 from collections.abc import Sequence as Items
 
 from ._evaluate import ActionError, means
@@ -72,10 +73,14 @@ def _means(rows: Items[ActionError], engine: str) -> list[str]:
                 f"| {method} | {name} | {m['rmse_vertices_mm']:.1f} | {m['mse_vertices_mm2']:.0f}"
                 f" | {m['rmse_texels_mm']:.1f} | {100 * m['penetration_share']:.2f}"
                 f" | {100 * m['pinched_share']:.2f} | {m['strain_p99']:.2f}"
-                f" | {m['wrinkle_deg']:.1f} | {m['jitter'] / m['jitter_reference']:.2f}"
+                f" | {m['wrinkle_deg']:.1f} | {_share(m['jitter'], m['jitter_reference'])}"
                 f" | {m['ms_per_frame']:.1f} |"
             )
     return lines
+
+
+def _share(part: float, whole: float) -> str:
+    return f"{part / whole:.2f}" if whole > 0 and math.isfinite(part) else ""
 
 
 def _actions(rows: Items[ActionError], name: str) -> list[str]:

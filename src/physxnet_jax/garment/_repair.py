@@ -27,6 +27,7 @@ WELD = 1e-4
 
 _THIN = 1e-10
 _MOST = 400_000
+_MOST_PAIRS = 20_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,7 +134,7 @@ def orient(mesh: TriMesh, body: TriMesh) -> TriMesh:
     corner = x[turned]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     _, away = clearance(body, corner.mean(axis=1).astype(np.float32))
-    part = connected_components(turned, len(x))[turned[:, 0]]
+    part = _sheets(faces)
     outward = np.bincount(part, np.einsum("fi,fi->f", normal, away))
     flipped = sense ^ (outward < 0)[part]
     uv_faces = None
@@ -240,10 +241,18 @@ def _remade(
 
 def _clusters(x: Float[np.ndarray, "vertices 3"], distance: float) -> Int[np.ndarray, " vertices"]:
     """A number for each vertex, the same for those that are linked; in order of the first."""
-    pairs = KDTree(x).query_pairs(distance, output_type="ndarray")
+    # Of what coincides one is enough: pairs among many would fill the memory.
+    places, which = np.unique(x, axis=0, return_inverse=True)
+    tree = KDTree(places)
+    if tree.count_neighbors(tree, distance) > _MOST_PAIRS:
+        raise MeshError(
+            f"{len(x):,} vertices lie so close that most are within {1e3 * distance:g} mm of"
+            " thousands of others. Export it in another unit, or decimate it first."
+        )
+    pairs = tree.query_pairs(distance, output_type="ndarray")
     ones = np.ones(len(pairs), dtype=np.int8)
-    graph = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (len(x), len(x)))
-    label = components(graph, directed=False)[1]
+    graph = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (len(places), len(places)))
+    label = components(graph, directed=False)[1][which.reshape(-1)]
     _, first, number = np.unique(label, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[number]
 
@@ -259,6 +268,15 @@ def _areas(
 ) -> Float[np.ndarray, " faces"]:
     a, b, c = (x[faces[:, k]] for k in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _sheets(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, " faces"]:
+    """A number for each face, the same for those that edges of two faces join."""
+    edges = mesh_edges(faces)
+    pairs = edges.faces[edges.count == 2].astype(np.int64)
+    ones = np.ones(len(pairs), np.int8)
+    graph = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (len(faces), len(faces)))
+    return components(graph, directed=False)[1]
 
 
 def _senses(faces: Int[np.ndarray, "faces 3"]) -> Bool[np.ndarray, " faces"]:

@@ -14,6 +14,9 @@ from ._rotation import safe_normalize
 from ._topology import mesh_edges
 
 _FACE_CHUNK = 256
+# Squares of lengths and of areas below this have no finite inverse square in float32, which
+# derivatives of quotients take; so short an edge is a point, so thin a triangle a line.
+_LEAST = 1e-18
 
 
 @pytree
@@ -60,7 +63,7 @@ def closest_barycentric(
     zero, one = jnp.zeros_like(ap[0]), jnp.ones_like(ap[0])
 
     def ratio(num: Array, den: Array) -> Array:
-        ok = den > 0
+        ok = den > _LEAST
         return jnp.where(ok, num / jnp.where(ok, den, one), zero)
 
     # The nearest of the three edges, each by itself: right for any degeneracy.
@@ -82,7 +85,7 @@ def closest_barycentric(
     v_in, w_in = ratio(d11 * d20 - d01 * d21, det), ratio(d00 * d21 - d01 * d20, det)
     gap = ap - v_in[None] * ab - w_in[None] * ac
     squared = _dot(gap, gap)
-    inside = (det > 0) & (v_in > 0) & (w_in > 0) & (v_in + w_in < 1) & (squared <= best)
+    inside = (det > _LEAST) & (v_in > 0) & (w_in > 0) & (v_in + w_in < 1) & (squared <= best)
     v, w = jnp.where(inside, v_in, v), jnp.where(inside, w_in, w)
     return jnp.stack([1 - v - w, v, w]), jnp.where(inside, squared, best)
 

@@ -164,6 +164,8 @@ def manifold_report(
     edges = mesh_edges(f)
     rows = np.sort(f, axis=1)
     half = np.concatenate([f[:, [1, 2]], f[:, [2, 0]], f[:, [0, 1]]])
+    # Of three faces at an edge two run in one sense, whatever they do.
+    half = half[edges.count[edges.of_face.T.reshape(-1)] == 2]
     repeated: Bool[np.ndarray, " n"] = np.unique(half, axis=0, return_counts=True)[1] > 1
     return {
         "boundary_edges": int((edges.count == 1).sum()),

@@ -9,6 +9,7 @@ from jaxtyping import Float, Int
 
 from ..errors import FormatError
 from ..files import read_arrays
+from ..motion import nominal_rate
 from ._clip import AnimatedMesh
 from ._mdd import read_mdd
 from ._obj import read_obj
@@ -99,7 +100,14 @@ def read_character(
     # What a damaged file holds may be infinite; it is refused below.
     with np.errstate(all="ignore"):
         parts, rate, up = read(path, fps)
-    whole = _joined(_picked(path, parts, mesh))
+    chosen = _picked(path, parts, mesh)
+    if len({len(p.positions) for p in chosen}) > 1 or not len(chosen[0].positions):
+        counts = ", ".join(f"{p.name} {len(p.positions)}" for p in chosen[:6])
+        raise FormatError(
+            f"{path}: meshes with {counts} frames. Export them over one range, or choose one with"
+            " --body-mesh."
+        )
+    whole = _joined(chosen)
     if whole.positions.size > _MOST:
         raise FormatError(f"{path}: {whole.positions.size:,} coordinates. Cut the clip.")
     # Beyond that their squares aren't finite in float32.
@@ -107,6 +115,13 @@ def read_character(
     if not all((np.abs(x) < _FARTHEST).all() for x in (whole.positions, binds)):
         raise FormatError(f"{path}: positions that aren't finite. Export it again.")
     rate = source_fps or rate or 30.0
+    seconds = (len(whole.positions) - 1) / rate
+    count = seconds * fps + 1 if frames is None else min(seconds * fps + 1, frames)
+    if count * whole.positions[0].size > _MOST:
+        raise FormatError(
+            f"{path}: {seconds:.0f} s at {fps:g} frames a second are more than are read. Say its"
+            " true rate (--source-fps), or take fewer (--frames)."
+        )
     return _in_metres(path, _at_rate(whole, float(rate), float(fps), frames), up)
 
 
@@ -162,9 +177,10 @@ def _read_cache(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | N
         positions = read_pc2(path)
     else:
         positions, times = read_mdd(path)
-        step = np.diff(times)
-        if len(step) and np.isfinite(step).all() and np.median(step) > 1e-4:
-            rate = float(1.0 / np.median(step))
+        # Over the whole clip: single steps are known to seven digits of their time alone.
+        span = float(times[-1] - times[0])
+        if np.isfinite(span) and span > 1e-4 * (len(times) - 1):
+            rate = nominal_rate((len(times) - 1) / span)
     shape = read_obj(beside)
     if len(shape.vertices) != positions.shape[1]:
         raise FormatError(
@@ -214,7 +230,7 @@ def _joined(parts: Sequence[Moving]) -> Moving:
 def _at_rate(moving: Moving, rate: float, fps: float, frames: int | None) -> Moving:
     """The clip at another rate, linear between its frames."""
     x = moving.positions
-    count = int((len(x) - 1) * fps / rate + 1e-6) + 1
+    count = int((len(x) - 1) * fps / rate + 1e-3) + 1
     count = count if frames is None else min(count, frames)
     at = np.arange(count) * rate / fps
     low = np.minimum(at.astype(int), len(x) - 1)

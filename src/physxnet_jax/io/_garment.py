@@ -74,7 +74,8 @@ def load_garment(
     skinning weights are smoothed, so that a skirt isn't torn between the legs.
 
     Args:
-        path: An ``.obj`` file, or ``top``, ``bottom`` or ``dress``.
+        path: An ``.obj`` file, or ``top``, ``bottom`` or ``dress``. ``coat.obj=top`` says what
+            a file is dressed as, as ``kind`` does.
         body: The body; the built-in one by default.
         kind: Template to dress it by; guessed from what it covers if omitted.
 
@@ -86,6 +87,9 @@ def load_garment(
         FormatError: A file that can't be read.
     """
     body = load_body() if body is None else body
+    file, _, told = str(path).rpartition("=")
+    if file and told in TEMPLATES:
+        path, kind = file, told  # pyright: ignore[reportAssignmentType]
     if str(path) in TEMPLATES:
         g = template(str(path))  # pyright: ignore[reportArgumentType]
         report = GarmentReport(
@@ -124,6 +128,8 @@ def load_garment(
     loops = boundary_loops(raw.faces)
     if kind == "bottom" and loops:
         pinned[max(loops, key=lambda x: moved[x, 1].mean())] = True
+    # No cloth holds what no face uses: it would fall out of the scene.
+    pinned[np.setdiff1d(np.arange(len(v)), raw.faces)] = True
     garment = Garment(
         make_mesh(moved, raw.faces, raw.uv, raw.uv_faces, name=str(path)),
         jnp.asarray(pinned),
@@ -182,8 +188,9 @@ def place_on_body(
         raise MeshError(
             f"{path}: no unit and up axis puts this mesh on the body: it measures"
             f" {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} and stays"
-            f" {score:.2f} m away on average. Move it onto the body at rest (A-pose,"
-            " Y up, origin in the pelvis) and export again."
+            f" {score:.2f} m away on average. Have it scaled and moved (physxnet fit"
+            f" {path} --like top, bottom or dress), or move it onto the body at rest, which"
+            " physxnet rest writes (A-pose, Y up, origin in the pelvis), and export again."
         )
     return v, unit, up
 

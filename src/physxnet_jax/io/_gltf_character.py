@@ -49,9 +49,13 @@ def _read(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, s
     file = GltfFile(path)
     times = file.frame_times(rate=fps)[0]
     if len(times) * len(file.document.nodes) > _MOST_NODES:
-        raise FormatError(f"{path}: {len(times):,} frames of {len(file.document.nodes)} nodes.")
+        raise FormatError(
+            f"{path}: {len(times):,} frames of {len(file.document.nodes)} nodes are more than are"
+            " read. Export a part of the clip, or the person alone."
+        )
     world, still = file.world(times), file.world()[0]
     parts: list[Moving] = []
+    points = 0
     for n, node in enumerate(file.document.nodes):
         if node.mesh is None:
             continue
@@ -62,6 +66,8 @@ def _read(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, s
                 continue
             name = str(node.name or mesh.name or f"mesh{node.mesh}")
             part = _primitive(file, primitive, name, weights)
+            points += part.positions.shape[1]
+            _check_size(file, len(times), points)
             if node.skin is not None:
                 part = _skinned(file, node.skin, primitive, part, world, still)
             else:
@@ -158,6 +164,8 @@ def _joint_weights(
     file: GltfFile, primitive: object, part: Moving, joints: int
 ) -> Float[np.ndarray, "vertices joints"]:
     vertices = part.positions.shape[1]
+    if vertices * float(joints) > _MOST:
+        raise FormatError(f"{file.path}: {joints:,} joints for {vertices:,} vertices. Export anew.")
     out = np.zeros((vertices, joints))
     attributes = primitive.attributes  # pyright: ignore[reportAttributeAccessIssue]
     for k in range(4):

@@ -132,8 +132,8 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         problems.append(f"its faces look inwards ({100 * outward:.0f} % look away from the body).")
     if health.non_manifold_edges:
         notes.append(
-            f"{health.non_manifold_edges:,} edges have more than two faces; they are kept, and bend"
-            " as several hinges."
+            f"{health.non_manifold_edges:,} edges have more than two faces; they are kept, and fold"
+            " without resistance."
         )
     if inside > _INSIDE:
         problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")

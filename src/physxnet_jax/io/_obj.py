@@ -72,6 +72,7 @@ def read_obj(path: str | pathlib.Path) -> ObjMesh:
     if not vertices or not polygons:
         raise FormatError(
             f"{path}: {len(vertices)} vertices and {len(polygons)} faces; a mesh needs both."
+            " Export the mesh with its faces."
         )
     v = np.asarray(vertices)
     for n, polygon in zip(where, polygons, strict=True):

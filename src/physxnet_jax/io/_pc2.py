@@ -28,7 +28,7 @@ def read_pc2(path: str | pathlib.Path) -> Float[np.ndarray, "frames vertices 3"]
     """
     blob = pathlib.Path(path).read_bytes()
     if len(blob) < _HEADER.size or not blob.startswith(b"POINTCACHE2\0"):
-        raise FormatError(f"{path}: not a PC2 cache.")
+        raise FormatError(f"{path}: not a PC2 cache. Export it again as PC2.")
     _, _, vertices, _, _, frames = _HEADER.unpack_from(blob)
     if vertices < 1 or frames < 1 or len(blob) != _HEADER.size + 12 * vertices * frames:
         raise FormatError(

@@ -22,7 +22,7 @@ def read_usd_meshes(
         fps: Not used: a stage has a rate of its own.
 
     Returns:
-        The meshes in metres, their rate, and the axis that is up.
+        The meshes in metres, their rate, and the axis that is up, if it is said.
 
     Raises:
         FormatError: Damaged, or too long.
@@ -57,14 +57,17 @@ def _read(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     rate = stage.GetTimeCodesPerSecond() or 24.0
     if not (np.isfinite([start, end, rate]).all() and 0 <= end - start < _FRAMES and rate > 0):
-        raise FormatError(f"{path}: runs from {start} to {end} at {rate} a second.")
+        raise FormatError(
+            f"{path}: runs from {start} to {end} at {rate} a second, not a"
+            f" clip of up to {_FRAMES:,} frames. Set the range of the clip and export again."
+        )
     if stage.HasAuthoredTimeCodeRange():
         UsdSkel.BakeSkinning(Usd.PrimRange(stage.GetPseudoRoot()))
     codes = start + np.arange(int(end - start) + 1)
     # Unsaid it would mean centimetres, which files in metres don't say either.
     said = UsdGeom.StageHasAuthoredMetersPerUnit(stage)
     unit = UsdGeom.GetStageMetersPerUnit(stage) if said else 1.0
-    parts = []
+    parts, points = [], 0
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
         if not prim.IsA(UsdGeom.Mesh):
             continue
@@ -79,18 +82,22 @@ def _read(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
         faces = _triangles(np.asarray(counts), np.asarray(corners))
         if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(first):
             raise FormatError(f"{path}: faces of {prim.GetPath()} don't fit its points.")
-        if len(codes) * len(first) * 3.0 > _MOST:
-            raise FormatError(f"{path}: {len(codes)} frames of {len(first):,} points. Cut it.")
+        if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
+            faces = np.ascontiguousarray(faces[:, ::-1])
+        points += len(first)
+        if len(codes) * points * 3.0 > _MOST:
+            raise FormatError(f"{path}: {len(codes)} frames of {points:,} points. Cut the clip.")
         x = np.zeros((len(codes), len(first), 3), np.float32)
         for k, code in enumerate(codes):
-            points = np.asarray(mesh.GetPointsAttr().Get(code), float)
-            if points.shape != x.shape[1:]:
+            local = np.asarray(mesh.GetPointsAttr().Get(code), float)
+            if local.shape != x.shape[1:]:
                 raise FormatError(f"{path}: {prim.GetPath()} changes its number of points.")
             world = np.asarray(UsdGeom.XformCache(code).GetLocalToWorldTransform(prim))
-            x[k] = unit * (points @ world[:3, :3] + world[3, :3])
+            x[k] = unit * (local @ world[:3, :3] + world[3, :3])
         parts.append(Moving(prim.GetName(), x, faces))
     moving = [p for p in parts if np.ptp(p.positions, axis=0).max() > 0] or parts
-    return moving, float(rate), str(UsdGeom.GetStageUpAxis(stage))
+    up = str(UsdGeom.GetStageUpAxis(stage)) if stage.HasAuthoredMetadata("upAxis") else None
+    return moving, float(rate), up
 
 
 def _triangles(counts: np.ndarray, corners: np.ndarray) -> np.ndarray:

@@ -51,10 +51,27 @@ def save_predictor(
         predictor: What to write.
         name: Its name.
         card: Anything else to tell: data, licence, measured table.
+
+    Raises:
+        WeightsError: A predictor that couldn't be read again: its network is a mean, its
+            batch norm is folded, or it asks for the mirrored person (save it without, and
+            call the weights with ``+mirror``). Or parameters beyond half precision.
     """
     folder = pathlib.Path(folder)
-    if isinstance(nnx.merge(predictor.graph, predictor.state), MeanGenerator):
+    network = nnx.merge(predictor.graph, predictor.state)
+    if isinstance(network, MeanGenerator):
         raise WeightsError(f"{name}: a mean of networks isn't saved; save the networks.")
+    plain = nnx.eval_shape(lambda: make_generator(predictor.config))
+    if jax.tree.structure(nnx.state(network)) != jax.tree.structure(nnx.state(plain)):
+        raise WeightsError(
+            f"{name}: this network has been folded or is none of make_generator's; save the"
+            " predictor that was trained or loaded."
+        )
+    if predictor.mirrored:
+        raise WeightsError(
+            f"{name}: a predictor that asks for the mirrored person is saved without that; name"
+            " the weights with +mirror when they are loaded."
+        )
     tensors: dict[str, np.ndarray] = {}
     for k, (path, x) in enumerate(jax.tree_util.tree_leaves_with_path(predictor.state)):
         # Batch statistics keep float32: a variance may leave the range of float16.
@@ -114,14 +131,25 @@ def list_weights() -> list[str]:
 
 
 def read_card(weights: str | pathlib.Path = DEFAULT) -> dict[str, Any]:
-    """The card of weights by name or folder."""
-    return json.loads((_folder(weights) / _CARD).read_text())
+    """The card of weights by name or folder.
+
+    Raises:
+        WeightsError: Unknown name, or a card that isn't one.
+    """
+    path = _folder(weights) / _CARD
+    try:
+        card = json.loads(path.read_text())
+    except ValueError as error:
+        raise WeightsError(f"{path}: not a card ({error}). Reinstall or copy it again.") from None
+    if not isinstance(card, dict):
+        raise WeightsError(f"{path}: not a card. Reinstall or copy it again.")
+    return card
 
 
 def weights_size(weights: str | pathlib.Path = DEFAULT) -> int:
     """Bytes of a network's tensors on disk."""
     folder = _folder(weights)
-    parts = _parts(json.loads((folder / _CARD).read_text()))
+    parts = _parts(read_card(weights))
     return sum((f / _TENSORS).stat().st_size for f in parts or [folder])
 
 
@@ -150,7 +178,12 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
             f"{weights}: the card or the tensors are damaged ({type(error).__name__}:"
             f" {str(error)[:200]}). Reinstall or copy them again."
         ) from error
-    return ask_mirrored(predictor) if str(weights).endswith(MIRROR) else predictor
+    if not str(weights).endswith(MIRROR):
+        return predictor
+    try:
+        return ask_mirrored(predictor)
+    except ValueError as error:
+        raise WeightsError(f"{weights}: {error}") from None
 
 
 def _model(card: dict[str, Any]) -> ModelConfig:

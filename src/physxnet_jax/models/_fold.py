@@ -50,6 +50,9 @@ def fold_batch_norm(predictor: Predictor) -> Predictor:
 
     Returns:
         The folded predictor; answers differ by rounding alone.
+
+    Raises:
+        TypeError: A network of other layers.
     """
     network = nnx.merge(predictor.graph, predictor.state, copy=True)
     for one in network.networks if isinstance(network, MeanGenerator) else (network,):

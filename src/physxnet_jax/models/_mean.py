@@ -51,8 +51,13 @@ def average_networks(predictors: Sequence[Predictor]) -> Predictor:
         scales = [(seen.velocity, p.normalisation.velocity)]
         scales.append((seen.acceleration, p.normalisation.acceleration))
         alike = all(np.isclose(float(a), float(b), rtol=1e-4) for a, b in scales)
+        alike &= all(
+            np.array_equal(p.surface.valid[t], first.surface.valid[t])
+            for t in first.config.templates
+            if p.config == first.config
+        )
         if p.config != first.config or p.mirrored != first.mirrored or not alike:
-            raise ValueError("networks of different configurations or input scales.")
+            raise ValueError("networks of different configurations, input scales or texels.")
         network = nnx.merge(p.graph, p.state, copy=True)
         if not isinstance(network, Generator):
             raise ValueError(f"a Generator is wanted, got {type(network).__name__}.")

@@ -142,8 +142,8 @@ class Predictor:
         decoders of ``templates`` are computed.
 
         Args:
-            rotations: World rotations of joints, with four frames before the first one
-                wanted (see `pad_clip`).
+            rotations: World rotations of joints, with `Inputs.window` - 1 frames before the
+                first one wanted (see `pad_clip`).
             translations: World translations of joints [m], likewise.
             fps: Frames a second.
             templates: Which maps.
@@ -311,7 +311,14 @@ class Wearable:
 def make_wearable(
     body: Body, rest: Float[Array, "all 3"], garment: Garment, binding: Binding
 ) -> Wearable:
-    """A garment ready to be dressed on a body shape."""
+    """A garment ready to be dressed on a body shape.
+
+    Args:
+        body: The body.
+        rest: `Body.rest_vertices` of that shape [m].
+        garment: What is worn.
+        binding: Of its vertices to an atlas, see `bind`.
+    """
     base, radius = rest, _SMOOTH
     if garment.template == "dress":
         base = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))

@@ -28,7 +28,11 @@ from ._skeletons import (
     find_joint_map as find_joint_map,
     read_joint_map as read_joint_map,
 )
-from ._source import SourceClip as SourceClip
+from ._source import (
+    MAX_JOINT_FRAMES as MAX_JOINT_FRAMES,
+    SourceClip as SourceClip,
+    nominal_rate as nominal_rate,
+)
 from ._transforms import (
     BLOCK as BLOCK,
     clip_transforms as clip_transforms,

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
-from ._source import SourceClip
+from ._source import MAX_JOINT_FRAMES, SourceClip
 
 AMASS_ARRAYS = (
     "trans",
@@ -85,6 +85,8 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
         raise _broken(path, f"poses {poses.shape}, trans {trans.shape}")
     if len(poses) == 0:
         raise _broken(path, "no frame")
+    if len(poses) * joints > MAX_JOINT_FRAMES:
+        raise _broken(path, f"{len(poses):,} frames: cut the clip")
     if any(a.dtype.kind not in "fiu" for a in (poses, trans)):
         raise _broken(path, f"poses are {poses.dtype}, trans {trans.dtype}")
     turns = poses[:, : 3 * joints].astype(np.float64)

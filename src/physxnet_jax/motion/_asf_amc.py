@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
 from ._source import MAX_JOINT_FRAMES, SourceClip
-from ._text import numbers, read_lines
+from ._text import is_count, numbers, read_lines
 
 # CMU's files carry no rate; the database was captured at 120 Hz.
 CMU_FPS = 120.0
@@ -45,7 +45,7 @@ def find_skeleton(path: pathlib.Path) -> pathlib.Path:
         path,
         None,
         f"no skeleton: looked for {', '.join(sorted({s + '.asf' for s in stems if s}))}",
-        "Put the subject's ASF beside it or name it (skeleton=…)",
+        "Put the subject's ASF beside it or name it (--skeleton FILE, skeleton=…)",
     )
 
 
@@ -207,7 +207,7 @@ def _read_frames(
         words = line.split()
         if not words or words[0][0] in "#:":
             continue
-        if len(words) == 1 and words[0].lstrip("-").isdigit():
+        if len(words) == 1 and is_count(words[0].removeprefix("-")):
             _check_complete(path, n, rows, frame)
             frame += 1
             if first is None:

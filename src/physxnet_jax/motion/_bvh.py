@@ -6,8 +6,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
-from ._source import MAX_JOINT_FRAMES, SourceClip
-from ._text import numbers, read_lines
+from ._source import MAX_JOINT_FRAMES, SourceClip, nominal_rate
+from ._text import is_count, numbers, read_lines
 
 _AXES = {"Xrotation": "X", "Yrotation": "Y", "Zrotation": "Z"}
 _SLOTS = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
@@ -161,7 +161,7 @@ def _add_channels(
     if not stack or stack[-1] < 0:
         raise MotionError.at(path, n, "CHANNELS outside a joint", "Check the hierarchy")
     names = words[2:]
-    if len(words) < 2 or not words[1].isdigit() or int(words[1]) != len(names):
+    if len(words) < 2 or not is_count(words[1]) or int(words[1]) != len(names):
         raise MotionError.at(
             path,
             n,
@@ -189,7 +189,7 @@ def _read_motion(
             path, start + 1, "no 'Frames:' after MOTION", "It is truncated: export again"
         )
     count = body[0][1].split(":")[1].split()
-    if len(count) != 1 or not count[0].isdecimal() or int(count[0]) == 0:
+    if len(count) != 1 or not is_count(count[0]) or int(count[0]) == 0:
         raise MotionError.at(
             path,
             body[0][0],
@@ -236,4 +236,4 @@ def _read_motion(
             f"a Frame Time of {step[0]} means {fps:.3g} frames a second",
             "Write it in seconds: 0.00833333 for 120 fps",
         )
-    return np.asarray(values), float(round(fps)) if abs(fps - round(fps)) < 0.05 else fps
+    return np.asarray(values), nominal_rate(fps)

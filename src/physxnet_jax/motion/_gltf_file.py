@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import MissingDependencyError, MotionError
 from ._motion import slerp
-from ._source import MAX_JOINT_FRAMES
+from ._source import MAX_JOINT_FRAMES, nominal_rate
 
 _MAX_BYTES = 1_000_000_000
 _MAX_NODES = 20_000
+_MOST_KEYS = 100_000_000
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _LENGTHS = {"translation": 3, "rotation": 4, "scale": 3}
@@ -163,17 +164,30 @@ class GltfFile:
             if len(times) > 1 and (kind in _LENGTHS or rate is not None)
         ]
         if not keys:
-            raise MotionError.at(
-                self.path, None, "no animation of nodes", "Export it with its animation"
-            )
+            return self._only_time(animation, rate)
         start, end = min(float(k[0]) for k in keys), max(float(k[-1]) for k in keys)
         if rate is None:
             step = min(float(np.median(np.diff(k))) for k in keys)
             rate = min(max(1.0 / max(step, 1e-6), 10.0), 240.0)
-            rate = float(round(rate)) if abs(rate - round(rate)) < 0.05 else rate
+            rate = nominal_rate(rate)
         if (end - start) * rate * len(self.parents) > MAX_JOINT_FRAMES:
             raise self.broken(f"an animation of {end - start:.0f} seconds")
         return start + np.arange(int((end - start) * rate + 1e-3) + 1) / rate, rate
+
+    def _only_time(
+        self, animation: int, rate: float | None
+    ) -> tuple[Float[np.ndarray, " frames"], float]:
+        """The time of the only key there is; a mesh that isn't animated stands still."""
+        keys = [
+            times
+            for (_, kind), (times, _, _) in self._tracks(animation).items()
+            if len(times) and (kind in _LENGTHS or rate is not None)
+        ]
+        if not keys and rate is None:
+            raise MotionError.at(
+                self.path, None, "no animation of nodes", "Export it with its animation"
+            )
+        return np.array([float(keys[0][0]) if keys else 0.0]), rate or 30.0
 
     def _tracks(self, animation: int) -> dict[tuple[int, str], tuple[np.ndarray, np.ndarray, str]]:
         document = self.document
@@ -181,6 +195,7 @@ class GltfFile:
             return {}
         a = document.animations[self.index(animation, document.animations, "animation")]
         out = {}
+        numbers = 0
         for channel in a.channels:
             kind = channel.target.path
             if channel.target.node is None or kind not in (*_LENGTHS, "weights"):
@@ -202,6 +217,10 @@ class GltfFile:
                 or (np.diff(times) < 0).any()
             ):
                 raise self.broken(f"the keys of node {node}, {kind}")
+            # Channels may share what is stored once.
+            numbers += times.size + values.size
+            if numbers > _MOST_KEYS:
+                raise self.broken("more keys than are read")
             out[node, kind] = (times, values, mode)
         return out
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from ..body import NUM_BODY_VERTICES, Body, linear_blend_skinning
 from ..errors import MotionError
 from ..typing import pytree
+from ._source import MAX_JOINT_FRAMES
 
 # Frames compiled together: clips of any length are cut into blocks of this many.
 _BLOCK = 32
@@ -125,12 +126,18 @@ def resample(motion: Motion, fps: float | int) -> Motion:
         duration isn't a whole number of new frames.
 
     Raises:
-        MotionError: If ``fps`` isn't positive.
+        MotionError: If ``fps`` isn't positive, or the result would fill the memory.
     """
     if not (np.isfinite(fps) and fps > 0):
         raise MotionError(f"fps is {fps}, expected a positive number.")
     duration = (motion.num_frames - 1) / motion.fps
-    frames = int(np.floor(duration * fps + 1e-6)) + 1
+    wanted = duration * fps
+    if wanted * motion.rotations.shape[1] > MAX_JOINT_FRAMES:
+        raise MotionError(
+            f"{duration:.0f} s at {fps:g} frames a second are more than are computed at once. Say"
+            " the file's true rate (source_fps), or cut the clip."
+        )
+    frames = int(np.floor(wanted + 1e-6)) + 1
     return sample(motion, np.arange(frames) / fps, fps)
 
 

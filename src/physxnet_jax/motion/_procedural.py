@@ -227,7 +227,7 @@ def procedural_clip(
     often = max(1, int(np.ceil(_STEPPED / fps)))
     rate = often * fps
     lead = int(np.ceil(4 * _GLIDE * rate))  # what smoothing reaches beyond both ends
-    kept = slice(lead, lead + often * round(seconds * fps), often)
+    kept = slice(lead, lead + often * max(1, round(seconds * fps)), often)
     t = np.arange(-lead, kept.stop + lead) / rate
     turns, air = CLIPS[name](t)
     down = {"Left": np.array([0.14, -1.0, 0.02]), "Right": np.array([-0.14, -1.0, 0.02])}

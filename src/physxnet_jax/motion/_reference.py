@@ -54,16 +54,20 @@ def reference_pose(
     first = source.rotations[0]
     limbs = {k: v for k, v in index.items() if k in LIMBS and LIMBS[k] in index}
     rest = source.rest_rotations()
+    stands = _stands(source, index, 1)
+    stance = _heading(_pose_positions(source, rest), index) if stands else np.eye(3)
     upright = np.abs(first[index["Hips"]] - rest[index["Hips"]]).max() < 0.1
     if may_have_t_pose and upright and len(source.root) > 1:
         pointing = limb_directions(source, index, first)
         sideways = [
-            (1.0 if k.startswith("Left") else -1.0) * pointing[k][0] for k in limbs if "Arm" in k
+            (1.0 if k.startswith("Left") else -1.0) * float(pointing[k] @ stance[:, 0])
+            for k in limbs
+            if "Arm" in k
         ]
         down = [-pointing[k][1] for k in limbs if "Leg" in k]
         if min(sideways + down) > _T_POSE:
-            return first, 1, np.eye(3)
-    if not _stands(source, index, 1):
+            return first, 1, stance
+    if not stands:
         frame = _straightest(source, index)
         return source.rotations[frame], 0, _stance(source, frame, index)
     # CMU's skeletons stand astride at rest: straighten each leg as one.
@@ -77,7 +81,23 @@ def reference_pose(
                 member.add(j)
         for j in member:
             pose[j] = turn.as_matrix() @ pose[j]
-    return pose, 0, np.eye(3)
+    return pose, 0, stance
+
+
+def _heading(
+    positions: Float[np.ndarray, "bones 3"], index: Mapping[str, int]
+) -> Float[np.ndarray, "3 3"]:
+    """Left, up and forward of a standing skeleton; the world's axes within 45 degrees of them.
+
+    Hips of real skeletons aren't quite level with an axis that their makers meant.
+    """
+    left = positions[index["LeftUpLeg"]] - positions[index["RightUpLeg"]]
+    left = left * [1.0, 0.0, 1.0]
+    size = np.linalg.norm(left)
+    if not _SHORTEST < size < _LONGEST or left[0] > _STANDING * size:
+        return np.eye(3)
+    left, up = left / size, np.array([0.0, 1.0, 0.0])
+    return np.stack([left, up, np.cross(left, up)], axis=1)
 
 
 def _straightest(source: SourceClip, index: Mapping[str, int]) -> int:

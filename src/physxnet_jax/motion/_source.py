@@ -8,6 +8,21 @@ from jaxtyping import Float
 MAX_JOINT_FRAMES = 5e7
 """Frames times joints that a clip may have: an hour at 120 fps of a hundred joints."""
 
+_BROADCAST = tuple(k * 1000.0 / 1001.0 for k in (24, 30, 48, 60, 120))
+
+
+def nominal_rate(fps: float) -> float:
+    """The rate that a file means by a rounded one [1/s]: a whole one or a broadcaster's.
+
+    Example:
+        >>> nominal_rate(1 / 0.0083333), nominal_rate(1 / 0.0333)
+        (120.0, 30.0)
+        >>> round(nominal_rate(29.97), 5)
+        29.97003
+    """
+    nearest = min((float(round(fps)), *_BROADCAST), key=lambda r: abs(r - fps))
+    return nearest if nearest > 0 and abs(nearest - fps) < 0.05 else fps
+
 
 @dataclasses.dataclass(frozen=True)
 class SourceClip:

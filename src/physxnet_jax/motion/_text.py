@@ -1,5 +1,6 @@
 """Reading motion text files with errors that name file, line and fix."""
 
+import math
 import pathlib
 
 from ..errors import MotionError
@@ -35,26 +36,36 @@ def read_lines(path: pathlib.Path, kind: str) -> list[str]:
         return blob.decode("latin-1").splitlines()
 
 
+def is_count(word: str) -> bool:
+    """Whether a word is a whole number of digits that int() takes, and not absurdly many."""
+    return word.isascii() and word.isdigit() and len(word) < 19
+
+
 def numbers(path: pathlib.Path, line: int, words: list[str]) -> list[float]:
     """Finite numbers of one line.
 
     Raises:
         MotionError: A word that isn't a number, or NaN or infinity.
     """
-    out = []
+    # Files hold millions: the words are looked at one by one only where something is wrong.
+    try:
+        out = list(map(float, words))
+    except ValueError:
+        out = []
+    if len(out) == len(words) and all(map(math.isfinite, out)):
+        return out
     for word in words:
         try:
-            value = float(word)
+            finite = math.isfinite(float(word))
         except ValueError:
             raise MotionError.at(
                 path, line, f"'{word[:40]}' is not a number", "Export the clip again"
             ) from None
-        if value != value or value in (float("inf"), float("-inf")):
+        if not finite:
             raise MotionError.at(
                 path,
                 line,
                 f"the value '{word[:40]}' is not finite",
                 "Cut this frame out or interpolate over it",
             )
-        out.append(value)
     return out

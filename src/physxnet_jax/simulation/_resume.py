@@ -1,8 +1,8 @@
 """Rollouts that go on where they were stopped."""
 
+import contextlib
 import hashlib
 import pathlib
-import shutil
 from typing import Any
 
 import jax
@@ -24,7 +24,7 @@ class Resume:
         key: What the rollout is, see `fingerprint`.
 
     Raises:
-        SimulationError: The folder holds another rollout.
+        SimulationError: The folder holds another rollout, or something else.
     """
 
     def __init__(self, folder: str | pathlib.Path, key: str) -> None:
@@ -34,6 +34,11 @@ class Resume:
             raise SimulationError(
                 f"{self.folder} holds an unfinished rollout of another scene, motion or"
                 " setting. Finish that one, or remove the folder."
+            )
+        if not label.is_file() and self.folder.is_dir() and any(self.folder.iterdir()):
+            raise SimulationError(
+                f"{self.folder} holds files that are no rollout's. Name an empty folder, or none"
+                " that is there."
             )
         with whole_file(label) as part:
             part.write_text(key)
@@ -59,8 +64,11 @@ class Resume:
             np.savez(file, allow_pickle=False, positions=positions, **arrays)
 
     def finish(self) -> None:
-        """Removes the folder."""
-        shutil.rmtree(self.folder)
+        """Removes what was kept, and the folder if nothing else is in it."""
+        for file in (self.folder / "key.txt", *self.folder.glob("block_*.npz")):
+            file.unlink()
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
 
     def _path(self, index: int) -> pathlib.Path:
         return self.folder / f"block_{index:05d}.npz"

@@ -12,6 +12,9 @@ from ..errors import SimulationError
 from ..typing import pytree
 from ._effect import Attached, Placed, Prepared
 
+# As where the body itself is skinned.
+_EXACT = jax.lax.Precision.HIGHEST
+
 
 @pytree
 @dataclasses.dataclass(frozen=True)
@@ -85,8 +88,9 @@ def place(
     def one(q: Array, p: Array) -> tuple[Array, Array]:
         world, shift = body.transforms(rest, q, p)
         blend = blend_rotations(attached.weights, world)
-        points = jnp.einsum("vab,vb->va", blend, attached.rest) + attached.weights @ shift
-        return points, jnp.einsum("vab,vb->va", blend, attached.normals)
+        points = jnp.einsum("vab,vb->va", blend, attached.rest, precision=_EXACT)
+        points = points + jnp.matmul(attached.weights, shift, precision=_EXACT)
+        return points, jnp.einsum("vab,vb->va", blend, attached.normals, precision=_EXACT)
 
     points, normals = jax.vmap(one, out_axes=2)(rotations, root)
     return Placed(points, normals)

@@ -1,6 +1,7 @@
 """Training frames in memory, and batches that a step number alone decides."""
 
 import dataclasses
+import hashlib
 from collections.abc import Iterable
 
 import jax
@@ -28,8 +29,9 @@ from ..uv import Transference
 
 # A cloth this deep in the body has come off: such a sequence teaches nothing.
 MAX_PENETRATION = 0.1
-# Sleeves and trouser legs this far from their skinning have lost their limb [m]. Skirts may be.
-MAX_OFFSET = 0.5
+# Sleeves and trouser legs this far from their skinning have lost their limb [m]. Skirts may be,
+# but one this far has come off, and targets have sixteen bits of a tenth of a millimetre.
+MAX_OFFSET, MAX_SKIRT = 0.5, 3.0
 _CHUNK = 16
 
 
@@ -44,7 +46,7 @@ class Frames:
         targets: For each template, cloth offsets [0.1 mm], shape [frames, vertices, 3].
         usable: For each template, which frames count, shape [frames].
         fps: Frames a second.
-        identity: Names and lengths of the sequences: a run is tied to its data.
+        identity: Names, lengths and contents of the sequences: a run is tied to its data.
     """
 
     rotations: Float[np.ndarray, "frames window joints 3 3"]
@@ -67,8 +69,8 @@ def teaches(sequence: Sequence, name: str) -> bool:
     """Whether a simulated garment is one to learn from: it stayed on the body and its limbs."""
     if name not in sequence.offsets or not usable_garment(sequence.meta[name]):
         return False
-    far = np.linalg.norm(sequence.offsets[name], axis=2) > MAX_OFFSET
-    return name == "dress" or not far.any()
+    most = MAX_SKIRT if name == "dress" else MAX_OFFSET
+    return bool((np.linalg.norm(sequence.offsets[name], axis=2) <= most).all())
 
 
 def load_frames(
@@ -95,7 +97,7 @@ def load_frames(
         rates.add(s.motion.fps)
         if len(rates) != 1:
             raise FormatError(f"sequences of different frame rates: {sorted(rates)}.")
-        told.append(f"{s.name} {s.motion.num_frames}")
+        told.append(f"{s.name} {s.motion.num_frames} {_content(s)}")
         world, shift = clip_transforms(body, rest, s.motion)
         rotations.append(np.asarray(pose_windows(world, inputs)))
         translations.append(np.asarray(pose_windows(shift, inputs)))
@@ -121,6 +123,15 @@ def load_frames(
         rates.pop(),
         ", ".join(told),
     )
+
+
+def _content(sequence: Sequence) -> str:
+    """A short hash of a sequence's cloth."""
+    digest = hashlib.sha256()
+    for name in sorted(sequence.offsets):
+        digest.update(name.encode())
+        digest.update(np.round(sequence.offsets[name] / QUANTUM).astype(np.int16).tobytes())
+    return digest.hexdigest()[:8]
 
 
 def _to_local(

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 
+from ..errors import PhysXNetError
 from ._step import TrainState
 
 
@@ -28,14 +29,31 @@ class Checkpoints:
         )
 
     def save(self, state: TrainState, info: dict[str, Any]) -> None:
-        """Saves a state under its step number; whole or not at all."""
-        self._manager.save(
+        """Saves a state under its step number; whole or not at all.
+
+        Raises:
+            PhysXNetError: A later state lies there.
+        """
+        if self._manager.latest_step() == int(state.step):
+            return
+        saved = self._manager.save(
             int(state.step),
             args=ocp.args.Composite(
                 state=ocp.args.StandardSave(_plain(state)), info=ocp.args.JsonSave(info)
             ),
         )
         self._manager.wait_until_finished()
+        if not saved:
+            raise PhysXNetError(
+                f"{self._manager.directory}: step {int(state.step)} wasn't saved, step"
+                f" {self._manager.latest_step()} lies there. Delete it, or choose another folder."
+            )
+
+    def forget_after(self, step: int) -> None:
+        """Removes states of later steps: a run that was killed will do those again."""
+        for later in self._manager.all_steps():
+            if later > step:
+                self._manager.delete(later)
 
     def latest(self, like: TrainState) -> TrainState | None:
         """The newest state, shaped as ``like``; None if there is none."""

@@ -101,6 +101,7 @@ def train(
     restored = checkpoints.latest(run.first)
     state = run.first if restored is None else restored
     done = int(state.step)
+    best_kept.forget_after(done)
     watch = Validation(read_metrics(folder), done, config.patience)
     players = Players()
     key = jax.random.key(config.seed)
@@ -108,6 +109,9 @@ def train(
     began = time.perf_counter()
     try:
         with (folder / METRICS).open("a") as log:
+            # A line that a kill cut short ends here, or the next would be lost with it.
+            if log.tell() and not (folder / METRICS).read_bytes().endswith(b"\n"):
+                log.write("\n")
 
             def note(values: dict[str, float]) -> None:
                 values |= {"step": done, "seconds": round(time.perf_counter() - began, 3)}
@@ -134,7 +138,8 @@ def train(
                 if done % 20 == 0 or last:
                     values = {k: float(v) for k, v in metrics.items()}
                     note(values | players.update(values))
-                if unseen is not None and (done % config.validate_every == 0 or last):
+                # On schedule alone: a run that is stopped on the way has to be the same run.
+                if unseen is not None and (done % config.validate_every == 0 or done == total):
                     losses, shown = _validate(config, run, state, unseen)
                     if watch.update(losses["validation_mm"]):
                         best_kept.save(state, {"step": done, **losses})

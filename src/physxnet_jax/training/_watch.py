@@ -43,14 +43,17 @@ class Validation:
 
     def __init__(self, lines: Sequence[Mapping[str, Any]], step: int, patience: int) -> None:
         self.best, self._since, self._patience = math.inf, 0, patience
-        for line in lines:
-            if "validation_mm" in line and line["step"] <= step:
-                self.update(line["validation_mm"])
+        # Steps that were done again after a kill are there twice.
+        told = {x["step"]: x["validation_mm"] for x in lines if "validation_mm" in x}
+        for at in sorted(told):
+            if at <= step:
+                self.update(told[at])
 
     def update(self, value: float) -> bool:
         """Takes a measurement; whether it is the best so far."""
         better = value < self.best
-        self.best = min(value, self.best)
+        # Not min(): one that isn't a number would be the best for ever.
+        self.best = value if better else self.best
         self._since = 0 if better else self._since + 1
         return better
 

@@ -16,4 +16,4 @@ from ._maps import (
     velocity_maps as velocity_maps,
 )
 from ._rasterise import rasterise as rasterise
-from ._transference import Transference as Transference, identity_rows as identity_rows
+from ._transference import Transference as Transference

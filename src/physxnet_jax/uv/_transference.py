@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from ..geometry import interpolate
@@ -35,14 +34,3 @@ class Transference:
     ) -> Float[Array, "*batch rows channels"]:
         """Values at vertices carried to the rows; the unit stays."""
         return interpolate(values, self.vertices, self.weights)
-
-    @property
-    def num_rows(self) -> int:
-        """Number of rows."""
-        return self.vertices.shape[0]
-
-
-def identity_rows(index: Int[Array, " rows"]) -> Transference:
-    """The transference that picks single vertices."""
-    one = jnp.zeros((index.shape[0], 3), jnp.float32).at[:, 0].set(1.0)
-    return Transference(jnp.repeat(index[:, None], 3, axis=1), one, jnp.ones(index.shape, bool))

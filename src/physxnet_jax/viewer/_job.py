@@ -16,7 +16,7 @@ from ..dressing import animated_meshes, dress, fit_surface, load_ladder, make_sc
 from ..errors import PhysXNetError
 from ..io import DEFAULT, AnimatedMesh, load_predictor, read_card
 from ..models import Predictor
-from ..motion import Motion, clip_transforms, load_motion, stand_on_floor
+from ..motion import BLOCK, Motion, clip_transforms, load_motion, stand_on_floor
 from ..simulation import ACCURACY, Air, Effect, SelfContact, prepare_scene, simulate_batch
 from ._maps import frame_maps
 
@@ -42,6 +42,8 @@ class Choice:
         self_contact: Garments collide with themselves when simulated.
         frames: Frames at most.
         fps: Frames a second.
+        source_fps: True rate of a motion file [1/s], where its header is wrong or silent.
+        skeleton: The ASF of an AMC file, if it doesn't lie beside it.
         joint_map: File of joint names for a motion file of unknown ones.
     """
 
@@ -58,6 +60,8 @@ class Choice:
     self_contact: bool = False
     frames: int = 150
     fps: float = 30.0
+    source_fps: float | None = None
+    skeleton: pathlib.Path | None = None
     joint_map: pathlib.Path | None = None
 
 
@@ -138,7 +142,13 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
     body = load_body()
     shape = _shape(choice)
     clip = load_motion(
-        choice.motion, fps=choice.fps, joint_map=choice.joint_map, body=body, shape=shape
+        choice.motion,
+        fps=choice.fps,
+        source_fps=choice.source_fps,
+        skeleton=choice.skeleton,
+        joint_map=choice.joint_map,
+        body=body,
+        shape=shape,
     )
     clip = dataclasses.replace(
         clip, rotations=clip.rotations[: choice.frames], root=clip.root[: choice.frames]
@@ -167,7 +177,7 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
         )
         garments = dressed.garments
         stage = next(s for s in dressed.stages if s.name in ("network", "skinning"))
-        cost = f"first 32 frames {stage.cold_ms:.0f} ms"
+        cost = f"first {BLOCK} frames {stage.cold_ms:.0f} ms"
         if stage.warm_ms is not None:
             cost = f"{stage.warm_ms:.1f} ms a frame ({cost})"
         inside = 100 * float(np.mean(list(dressed.inside.values())))

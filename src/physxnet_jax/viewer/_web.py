@@ -90,9 +90,15 @@ class Viewer:
             if abs(handle.value - ordinary[name]) > 1e-6
         )
         motion = str(w["motion"].value)
+        motion = str(self._files.get(motion, motion))
+        first = self._first
+        # What was said of one file isn't true of another.
+        known = motion == str(pathlib.Path(first.motion))
         return dataclasses.replace(
-            self._first,
-            motion=str(self._files.get(motion, motion)),
+            first,
+            motion=motion,
+            source_fps=first.source_fps if known else None,
+            skeleton=first.skeleton if known else None,
             wear=tuple(
                 str(self._files.get(name, name)) for name, box in self._worn.items() if box.value
             ),

@@ -33,6 +33,10 @@ class Membrane(Effect):
 
     compression: float = 0.2
 
+    def __post_init__(self) -> None:
+        if not self.compression > 0:
+            raise ValueError(f"compression is {self.compression}, expected a positive number")
+
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Colours the triangles; slivers are left out."""
         faces, area, inverse = rest_frames(assembly)

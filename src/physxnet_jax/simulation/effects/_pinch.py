@@ -54,7 +54,9 @@ class Pinch:
         stop = jax.lax.stop_gradient
         squared = jnp.sum(p * p, axis=1)
         # The points' own squared length doesn't change which is the nearest.
-        gap = squared[None] - 2.0 * jnp.einsum("sib,tib->stb", stop(p), stop(p))
+        gap = squared[None] - 2.0 * jnp.einsum(
+            "sib,tib->stb", stop(p), stop(p), precision=jax.lax.Precision.HIGHEST
+        )
         nearest = jnp.argmin(jnp.where(self.facing[..., None], gap, jnp.inf), axis=1)
         lane = jnp.arange(p.shape[2], dtype=nearest.dtype)[None]
         away = p - jnp.moveaxis(p[nearest, :, lane], -1, 1)

@@ -34,6 +34,10 @@ class Stretch(Effect):
 
     compression: float = 0.2
 
+    def __post_init__(self) -> None:
+        if not self.compression > 0:
+            raise ValueError(f"compression is {self.compression}, expected a positive number")
+
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Colours the edges so that a Gauss-Seidel sweep runs colour by colour."""
         x, f = assembly.rest, assembly.faces
