@@ -2,7 +2,7 @@
 
 Command: python experiments/ablations.py --data runs/ours --extra runs/extra --slow runs/slow
          --other runs/blender
-Cost:    5 to 10 minutes a variant on two cores beside other work (larger maps: not run);
+Cost:    5 to 10 minutes a variant on two cores beside other work (maps of 256 x 256: not run);
          goes on where it was stopped. Variants whose dataset isn't built are left out and said so.
 Result:  experiments/results/ablations.json and .md: RMSE over vertices of the twelve test
          actions for each template, beside skinning. The seconds of a training step are in

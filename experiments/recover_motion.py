@@ -4,7 +4,7 @@ Command: python experiments/recover_motion.py
          --motion walk (a built-in clip or a motion file), --wear top bottom, --frames 12,
          --steps 200, --weights local, --target simulate (or network),
          --out experiments/results/recover_motion.json
-Cost:    not run in full yet.
+Cost:    3 minutes on two cores beside other work.
 Result:  recover_motion.json: how far joints are off when clothes are explained by skinning
          alone and by the network, and before. The clothes come from the simulator, which
          neither of them is; with --target network the network explains its own.
