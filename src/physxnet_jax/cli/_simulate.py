@@ -133,17 +133,7 @@ def _scene_file(command: Simulate | Effects) -> SceneFile:
                 f"{command.scene}: a scene file tells its garments, fabrics, effects and motion"
                 f" itself; write it there and leave --{name.replace('_', '-')} out."
             )
-    job = load_scene(command.scene)
-    if command.frames is None:
-        return job
-    if command.frames < 1:
-        raise FormatError(f"frames is {command.frames}; ask for at least one.")
-    motion = dataclasses.replace(
-        job.motion,
-        rotations=job.motion.rotations[: command.frames],
-        root=job.motion.root[: command.frames],
-    )
-    return dataclasses.replace(job, motion=motion)
+    return load_scene(command.scene, frames=command.frames)
 
 
 _SHOWN = {

@@ -113,8 +113,12 @@ def make_scene(
     return SceneFile(Scene(tuple(garments), _merged(acting, also), body, shape), clip, accuracy)
 
 
-def load_scene(path: str | pathlib.Path) -> SceneFile:
+def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneFile:
     """Reads a scene from TOML; files in it are looked for beside it.
+
+    Args:
+        path: The file.
+        frames: Keep no more frames than this, however many it asks for.
 
     ::
 
@@ -183,7 +187,7 @@ def load_scene(path: str | pathlib.Path) -> SceneFile:
         source_fps=text.get("source_fps"),
         skeleton=_beside(path, text["skeleton"]) if "skeleton" in text else None,
         joint_map=_beside(path, text["joint_map"]) if "joint_map" in text else None,
-        frames=text.get("frames"),
+        frames=min((n for n in (frames, text.get("frames")) if n is not None), default=None),
         accuracy=text.get("accuracy", "standard"),
         shape=load_body().shape(**text["shape"]) if "shape" in text else None,
         effects=_effects(path, text["effects"]) if "effects" in text else None,

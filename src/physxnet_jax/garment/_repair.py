@@ -129,12 +129,11 @@ def orient(mesh: TriMesh, body: TriMesh) -> TriMesh:
         body: The closed body.
     """
     x, faces = _arrays(mesh)
-    sense = _senses(faces)
+    sense, part = _senses(faces)
     turned = np.where(sense[:, None], faces[:, ::-1], faces)
     corner = x[turned]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     _, away = clearance(body, corner.mean(axis=1).astype(np.float32))
-    part = _sheets(faces)
     outward = np.bincount(part, np.einsum("fi,fi->f", normal, away))
     flipped = sense ^ (outward < 0)[part]
     uv_faces = None
@@ -270,17 +269,13 @@ def _areas(
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def _sheets(faces: Int[np.ndarray, "faces 3"]) -> Int[np.ndarray, " faces"]:
-    """A number for each face, the same for those that edges of two faces join."""
-    edges = mesh_edges(faces)
-    pairs = edges.faces[edges.count == 2].astype(np.int64)
-    ones = np.ones(len(pairs), np.int8)
-    graph = coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (len(faces), len(faces)))
-    return components(graph, directed=False)[1]
+def _senses(
+    faces: Int[np.ndarray, "faces 3"],
+) -> tuple[Bool[np.ndarray, " faces"], Int[np.ndarray, " faces"]]:
+    """Faces to turn round so that neighbours run in one sense, the first of a part as it is.
 
-
-def _senses(faces: Int[np.ndarray, "faces 3"]) -> Bool[np.ndarray, " faces"]:
-    """Faces to turn round so that neighbours run in one sense, the first of a part as it is."""
+    A part is what edges of two faces join; its number comes with each face.
+    """
     edges = mesh_edges(faces)
     two = np.flatnonzero(edges.count == 2)
     pairs = edges.faces[two].astype(np.int64)
@@ -305,4 +300,4 @@ def _senses(faces: Int[np.ndarray, "faces 3"]) -> Bool[np.ndarray, " faces"]:
         turn = differ[np.searchsorted(keys, before[steps].astype(np.int64) * count + steps)]
         for face, turned in zip(steps, turn, strict=True):
             sense[face] = sense[before[face]] ^ turned
-    return sense
+    return sense, parts
