@@ -28,9 +28,11 @@ from physxnet_jax.data import (
 )
 from physxnet_jax.data._build import action_motion
 from physxnet_jax.errors import FormatError, MotionError
+from physxnet_jax.evaluation import skinning
 from physxnet_jax.garment import square_sheet
 from physxnet_jax.motion import load_motion, make_motion, save_motion
 from physxnet_jax.simulation import XPBD
+from physxnet_jax.training import teaches
 
 
 def stored(root, frames=70, seed=0):
@@ -148,6 +150,37 @@ def test_a_build_goes_on_where_it_was_and_is_another_with_another_solver(data_di
     assert dataset_digest(tmp_path)[0] == before, "same configuration, same bytes"
     with pytest.raises(FormatError, match="another configuration"):
         build(DatasetConfig(templates=("bottom",), solver=XPBD(16, 1)))
+
+
+def test_what_networks_answer_is_stored_as_a_dataset(data_dir, tmp_path):
+    networks = DatasetConfig(
+        engine="network", splits=("train",), templates=("bottom",), networks=("local", "small")
+    )
+    build = functools.partial(
+        build_dataset, root=tmp_path, folder=data_dir / "mocap", only=("run",)
+    )
+    lifted = np.float32([0.0, 0.01, 0.0])
+
+    def ask(motion, name):
+        return np.asarray(skinning()(motion, name).positions) + lifted
+
+    with pytest.raises(FormatError, match="what networks answer"):
+        build(networks)
+    with pytest.raises(FormatError, match="what networks answer"):
+        build(dataclasses.replace(networks, engine="physxnet", networks=()), ask=ask)
+    assert build(networks, ask=ask) == 1
+    (folder,) = list_sequences(tmp_path)
+    told = read_sequence(folder)
+    np.testing.assert_allclose(
+        told.offsets["bottom"], np.broadcast_to(lifted, told.offsets["bottom"].shape), atol=6e-5
+    )
+    assert told.meta["bottom"]["networks"] == ["local", "small"] and teaches(told, "bottom")
+    assert build(networks, ask=lambda *_: pytest.fail("it is there")) == 0
+    with pytest.raises(FormatError, match="another configuration"):
+        build(dataclasses.replace(networks, networks=("local",)), ask=ask)
+    for engine, names in (("network", ()), ("physxnet", ("local",))):
+        with pytest.raises(ValueError, match="name both"):
+            DatasetConfig(engine=engine, networks=names)
 
 
 def test_actions_are_changed_as_the_configuration_says(data_dir):

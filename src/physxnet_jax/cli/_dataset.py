@@ -4,6 +4,7 @@ import dataclasses
 import json
 import pathlib
 import time
+from collections.abc import Callable
 
 import numpy as np
 from rich.console import Console
@@ -20,10 +21,11 @@ from ..data import (
     read_sequence,
 )
 from ..errors import FormatError
-from ..evaluation import Finding, check_sequence, skinning
+from ..evaluation import Finding, check_sequence, network, skinning
 from ..files import whole_file
 from ..garment import TEMPLATES, Template, template
-from ..io import AnimatedMesh
+from ..io import AnimatedMesh, load_predictor
+from ..motion import Motion
 from ..viewer import render_frame
 from ._configs import mocap_folder, read_config
 from ._experiment_commands import Dataset
@@ -51,6 +53,7 @@ def _build(command: Dataset, console: Console) -> int:
             shard=shard,
             only=command.only,
             report=lambda text, k, n: progress("garments", k, n),
+            ask=_mean_answer(config.networks) if config.networks else None,
         )
     digest, size = dataset_digest(command.out)
     spent = sum(line["seconds"] for line in read_log(command.out))
@@ -60,6 +63,15 @@ def _build(command: Dataset, console: Console) -> int:
         highlight=False,
     )
     return 0
+
+
+def _mean_answer(names: tuple[str, ...]) -> Callable[[Motion, Template], np.ndarray]:
+    asked = [network(load_predictor(name)) for name in names]
+
+    def ask(motion: Motion, name: Template) -> np.ndarray:
+        return np.mean([method(motion, name).positions for method in asked], axis=0)
+
+    return ask
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..body import Body
 from ..errors import FormatError
-from ..garment import template
+from ..garment import Template, template
 from ..motion import (
     Motion,
     animate,
@@ -21,7 +21,7 @@ from ..motion import (
     mirrored,
     with_upper_body,
 )
-from ..simulation import PreparedScene, Scene, prepare_scene, simulate_batch
+from ..simulation import PreparedScene, Rollout, Scene, prepare_scene, simulate_batch
 from ..simulation.blender import simulate_blender
 from ._config import CARD, DatasetConfig
 from ._protocol import FPS, Action, left_out, load_action, read_protocol
@@ -45,6 +45,7 @@ def build_dataset(
     shard: tuple[int, int] = (0, 1),
     only: tuple[str, ...] = (),
     report: Callable[[str, int, int], None] | None = None,
+    ask: Callable[[Motion, Template], np.ndarray] | None = None,
 ) -> int:
     """Simulates actions and stores the cloth relative to its skinning.
 
@@ -58,15 +59,20 @@ def build_dataset(
         shard: ``(i, n)``: every n-th action from the i-th.
         only: Names of actions; all of them if empty.
         report: Called with a text, jobs done and jobs in all.
+        ask: What the networks of the configuration answer: a garment's vertices [m], shape
+            [frames, vertices, 3].
 
     Returns:
         Number of garments simulated now.
 
     Raises:
-        FormatError: Another dataset lies at ``root``, or ``only`` names no action of it.
+        FormatError: Another dataset lies at ``root``, ``only`` names no action of it, or
+            there is no ``ask`` for networks.
         MotionError: No protocol in ``folder``.
     """
     root = pathlib.Path(root)
+    if (config.engine == "network") != (ask is not None):
+        raise FormatError(f"engine {config.engine}: say what networks answer, for these alone.")
     actions = _chosen(folder, config.splits)
     unknown = set(only) - {a.name for a in actions}
     if unknown:
@@ -78,7 +84,8 @@ def build_dataset(
     if config.left_out:
         actions = left_out(folder, actions)
     open_dataset(root, _note(config))
-    jobs = [(t, a) for t in config.templates for a in actions[shard[0] :: shard[1]]]
+    mine = actions[shard[0] :: shard[1]]
+    jobs: list[tuple[Template, Action]] = [(t, a) for t in config.templates for a in mine]
     done = 0
     prepared: tuple[str, PreparedScene] | None = None
     for k, (name, action) in enumerate(jobs):
@@ -94,7 +101,7 @@ def build_dataset(
         scene = prepared[1]
         assembly = scene.assembly
         write_garment(root, name, assembly.rest, np.asarray(assembly.faces))
-        _simulate(config, target, name, action, scene, pathlib.Path(folder))
+        _simulate(config, target, name, action, scene, pathlib.Path(folder), ask)
         done += 1
     if report is not None:
         report("done", len(jobs), len(jobs))
@@ -146,16 +153,21 @@ def _changes(config: DatasetConfig) -> dict[str, Any]:
 def _simulate(
     config: DatasetConfig,
     target: pathlib.Path,
-    name: str,
+    name: Template,
     action: Action,
     scene: PreparedScene,
     folder: pathlib.Path,
+    ask: Callable[[Motion, Template], np.ndarray] | None,
 ) -> None:
     motion = action_motion(config, action, scene.assembly.body, folder)
     write_action(target, motion, action.split)
     began = time.perf_counter()
-    if config.engine == "blender":
-        rollout = simulate_blender(Scene((template(name),)), motion, settings=config.blender)  # pyright: ignore[reportArgumentType]
+    if ask is not None:
+        cloth = ask(motion, name)
+        finite = np.asarray(np.isfinite(cloth).all(axis=(1, 2)))
+        rollout = Rollout((cloth,), motion.fps, {"finite": finite})
+    elif config.engine == "blender":
+        rollout = simulate_blender(Scene((template(name),)), motion, settings=config.blender)
     else:
         rollout = simulate_batch(scene, [motion], solver=config.solver)[0]
     seconds = time.perf_counter() - began

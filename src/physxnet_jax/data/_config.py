@@ -20,7 +20,8 @@ class DatasetConfig:
     """Settings of a dataset.
 
     Attributes:
-        engine: ``physxnet`` (this package's simulator) or ``blender`` (the paper's).
+        engine: ``physxnet`` (this package's simulator), ``blender`` (the paper's) or
+            ``network``: what trained networks answer, for another one to learn from.
         splits: Of the protocol: ``train``, ``test``, ``extra``.
         templates: Garments, each simulated by itself.
         left_out: Not the actions themselves, but what the protocol leaves out of their
@@ -32,9 +33,10 @@ class DatasetConfig:
         exaggerate: Joints turn this many times as far from their mean rotation.
         solver: Settings of our simulator.
         blender: Settings of Blender's.
+        networks: Names or folders of weights whose mean answer is stored.
     """
 
-    engine: Literal["physxnet", "blender"] = "physxnet"
+    engine: Literal["physxnet", "blender", "network"] = "physxnet"
     splits: tuple[str, ...] = ("train", "test")
     templates: tuple[Template, ...] = TEMPLATES
     left_out: bool = False
@@ -44,8 +46,15 @@ class DatasetConfig:
     exaggerate: float = 1.0
     solver: XPBD = dataclasses.field(default_factory=XPBD)
     blender: BlenderSettings = dataclasses.field(default_factory=BlenderSettings)
+    networks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.engine == "network") != bool(self.networks):
+            raise ValueError(f"engine {self.engine} with networks {self.networks}: name both.")
 
     def settings(self) -> dict[str, Any]:
-        """What the engine is told, and nothing of the other one."""
+        """What the engine is told, and nothing of the others."""
+        if self.engine == "network":
+            return {"engine": self.engine, "networks": list(self.networks)}
         used = self.solver if self.engine == "physxnet" else self.blender
         return {"engine": self.engine, **dataclasses.asdict(used)}

@@ -21,7 +21,7 @@ from ..geometry import (
 )
 from ..models import Wearable, skin_points
 from ..typing import pytree
-from ._skirt import SkirtPatch, make_skirt_patch, skin_foot, skirt_lift
+from ._skirt import SkirtPatch, make_skirt_patch, skin_foot, skirt_lift, skirt_meeting
 
 _Result = TypeVar("_Result")
 
@@ -185,29 +185,35 @@ def _clearance(
 ) -> tuple[Float[Array, " vertices"], Float[Array, "vertices 3"]]:
     skin, normals = posed
     if patch.skirt is None:
-        return _clear_of_skin(patch, skin, normals, points, patch.least, patch.most)
+        feet = skin_foot(skin, normals, patch.faces, points, patch.candidates)
+        return _off_skin(points, feet, patch.least, patch.most)
     lying, rows = patch.skirt.lying, patch.skirt.rows
-    low, lift = _clear_of_skin(
-        patch, skin, normals, points[lying], patch.least[lying], patch.most[lying]
-    )
     turn = blend_rotations(patch.skirt.weights, rotations)
     outward = safe_normalize(jnp.einsum("hab,hb->ha", turn, patch.skirt.outward))
-    lifted, above = skirt_lift(
-        patch.skirt, points[rows], outward, skin, normals, patch.faces, patch.least[rows]
+    meeting = skirt_meeting(patch.skirt, points[rows], outward, skin, normals)
+    # One search for all: three would be three times the program to compile.
+    feet = skin_foot(
+        skin,
+        normals,
+        patch.faces,
+        jnp.concatenate([points[lying], *meeting.points]),
+        jnp.concatenate([patch.candidates, *meeting.candidates]),
     )
+    ends = np.cumsum([len(lying), len(rows), len(rows)])
+    on_skin, near, front = zip(*(jnp.split(x, ends[:-1]) for x in feet), strict=True)
+    low, lift = _off_skin(points[lying], on_skin, patch.least[lying], patch.most[lying])
+    lifted, above = skirt_lift(meeting, outward, near, front, patch.least[rows])
     order = patch.skirt.order
     return jnp.concatenate([low, above])[order], jnp.concatenate([lift, lifted])[order]
 
 
-def _clear_of_skin(
-    patch: SkinPatch,
-    skin: Float[Array, "skin 3"],
-    normals: Float[Array, "skin 3"],
+def _off_skin(
     points: Float[Array, "lying 3"],
+    feet: tuple[Float[Array, "lying 3"], Float[Array, "lying 3"]],
     least: Float[Array, " lying"],
     most: Float[Array, " lying"],
 ) -> tuple[Float[Array, " lying"], Float[Array, "lying 3"]]:
-    foot, normal = skin_foot(skin, normals, patch.faces, points, patch.candidates)
+    foot, normal = feet
     height = jnp.sum((points - foot) * normal, axis=1)
     # Deeper points are on another limb's far side, not in the skin.
     fade = jnp.clip((height + _DEEPEST) / (0.25 * _DEEPEST), 0.0, 1.0)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -124,20 +125,29 @@ def _leg_share(body: Body) -> Float[np.ndarray, " all"]:
     ].sum(axis=1)
 
 
-def skirt_lift(
+class Meeting(NamedTuple):
+    """Where hanging vertices may meet the legs: each by itself, and along its way out.
+
+    Attributes:
+        points: From where the nearest skin is looked for: the vertices, and the places on
+            their way out that are beside skin in front of them [m], shape [hanging, 3] each.
+        candidates: Triangles compared for each, shape [hanging, k] each.
+        cost: Squared distance at which the way out passes that skin [m^2], shape [hanging].
+    """
+
+    points: tuple[Float[Array, "hanging 3"], Float[Array, "hanging 3"]]
+    candidates: tuple[Int[Array, "hanging k"], Int[Array, "hanging k"]]
+    cost: Float[Array, " hanging"]
+
+
+def skirt_meeting(
     patch: SkirtPatch,
     points: Float[Array, "hanging 3"],
     outward: Float[Array, "hanging 3"],
     skin: Float[Array, "skin 3"],
     normals: Float[Array, "skin 3"],
-    faces: Int[Array, "faces 3"],
-    least: Float[Array, " hanging"],
-) -> tuple[Float[Array, "hanging 3"], Float[Array, " hanging"]]:
-    """How hanging vertices move so as to clear the legs.
-
-    A leg in front of the vertex, seen along the way out of the skirt, carries it: so a
-    leg that comes forward takes the front of the skirt along instead of poking through
-    it. Beside a leg, the vertex keeps off the nearest skin. The two blend.
+) -> Meeting:
+    """Which skin hanging vertices are near, and which is in front of them.
 
     Args:
         patch: The legs.
@@ -145,11 +155,6 @@ def skirt_lift(
         outward: The way out of the skirt in this pose, unit.
         skin: Skin vertices in this pose [m].
         normals: Their normals.
-        faces: Triangles over them.
-        least: Wanted height above the skin [m].
-
-    Returns:
-        Displacements [m] and heights above the nearest skin [m].
     """
     # All pairs as products of matrices, about a point among them, where sums of squares are
     # precise; which skin point is taken needs no derivative.
@@ -161,13 +166,7 @@ def skirt_lift(
     along = dense(way_out, m.T) - jnp.sum(p * way_out, axis=1)[:, None]
     facing = dense(way_out, n.T)
     squared = jnp.sum(p * p, axis=1)[:, None] + jnp.sum(m * m, axis=1)[None] - 2.0 * dense(p, m.T)
-
-    def meet(pick: Array, where: Array) -> tuple[Array, Array]:
-        return skin_foot(skin, normals, faces, where, patch.table[pick])
-
-    foot, near = meet(_least(squared, patch.compared), points)
-    height = jnp.sum((points - foot) * near, axis=1)
-    short = jnp.maximum(least - height, 0.0)[:, None] * near
+    nearest = _least(squared, patch.compared)
     # Skin in front of the vertex, seen along the way out.
     ahead = patch.compared & (facing > _FACING) & (along > -_SPACING) & (along < _FARTHEST)
     pick = _least(squared - along * along, ahead)
@@ -176,9 +175,40 @@ def skirt_lift(
     # The way out passes beside that skin point by the root of the cost.
     cost = jnp.sum(gap * gap, axis=1) - reach * reach
     cost = jnp.where(jnp.any(ahead, axis=1), cost, _MISS)
-    front, normal = meet(pick, points + reach[:, None] * outward)
+    beside = points + reach[:, None] * outward
+    return Meeting((points, beside), (patch.table[nearest], patch.table[pick]), cost)
+
+
+def skirt_lift(
+    meeting: Meeting,
+    outward: Float[Array, "hanging 3"],
+    near: tuple[Float[Array, "hanging 3"], Float[Array, "hanging 3"]],
+    front: tuple[Float[Array, "hanging 3"], Float[Array, "hanging 3"]],
+    least: Float[Array, " hanging"],
+) -> tuple[Float[Array, "hanging 3"], Float[Array, " hanging"]]:
+    """How hanging vertices move so as to clear the legs.
+
+    A leg in front of the vertex, seen along the way out of the skirt, carries it: so a
+    leg that comes forward takes the front of the skirt along instead of poking through
+    it. Beside a leg, the vertex keeps off the nearest skin. The two blend.
+
+    Args:
+        meeting: Where it may meet the legs.
+        outward: The way out of the skirt in this pose, unit.
+        near: `skin_foot` of its vertices.
+        front: `skin_foot` of the places on their way out.
+        least: Wanted height above the skin [m].
+
+    Returns:
+        Displacements [m] and heights above the nearest skin [m].
+    """
+    points, cost = meeting.points[0], meeting.cost
+    foot, up = near
+    height = jnp.sum((points - foot) * up, axis=1)
+    short = jnp.maximum(least - height, 0.0)[:, None] * up
+    foot, normal = front
     slope = jnp.maximum(jnp.sum(normal * outward, axis=1), _FACING)
-    way = (jnp.sum((front - points) * normal, axis=1) + least) / slope
+    way = (jnp.sum((foot - points) * normal, axis=1) + least) / slope
     share = jnp.clip((_MISS - cost) / (_MISS - _HIT), 0.0, 1.0)
     share = (share * share * (3 - 2 * share))[:, None]
     long = jnp.clip(way, 0.0, _FARTHEST)[:, None] * outward

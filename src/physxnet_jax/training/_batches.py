@@ -62,7 +62,8 @@ class Frames:
 
 def usable_garment(meta: dict) -> bool:
     """Whether a simulated garment stayed on the body."""
-    return bool(meta["finite"]) and meta["worst"]["penetration_max"] <= MAX_PENETRATION
+    # What a network answered wasn't measured: it can't come off.
+    return bool(meta["finite"]) and meta["worst"].get("penetration_max", 0.0) <= MAX_PENETRATION
 
 
 def teaches(sequence: Sequence, name: str) -> bool:
