@@ -215,23 +215,21 @@ def signed_distance(
     """
     hit = closest_points(mesh, points) if closest is None else closest
     edges = mesh_edges(np.asarray(mesh.faces))
+    return _signed(mesh, points, hit, jnp.asarray(edges.faces), jnp.asarray(edges.of_face))
+
+
+@jax.jit
+def _signed(
+    mesh: TriMesh,
+    points: Float[Array, "points 3"],
+    hit: ClosestPoints,
+    beside: Int[Array, "edges 2"],
+    of_face: Int[Array, "faces 3"],
+) -> Float[Array, " points"]:
     normals = face_normals(mesh.vertices, mesh.faces)
-    beside = jnp.asarray(edges.faces)
     second = jnp.where(beside[:, 1] >= 0, beside[:, 1], beside[:, 0])
     edge_normals = normals[beside[:, 0]] + normals[second]
     corner_normals = vertex_normals(mesh.vertices, mesh.faces)
-    return _sign(mesh, points, hit, normals, edge_normals, corner_normals, edges.of_face)
-
-
-def _sign(
-    mesh: TriMesh,
-    points: Array,
-    hit: ClosestPoints,
-    normals: Array,
-    edge_normals: Array,
-    corner_normals: Array,
-    of_face: Int[np.ndarray, "faces 3"],
-) -> Array:
     tiny = 1e-6
     on: Bool[Array, "points 3"] = hit.weights <= tiny
     count = jnp.sum(on.astype(jnp.int32), axis=1)
@@ -244,7 +242,7 @@ def _sign(
         corner_normals[tri[lane, corner]],
         jnp.where(
             (count == 1)[:, None],
-            edge_normals[jnp.asarray(of_face)[hit.face, gone]],
+            edge_normals[of_face[hit.face, gone]],
             normals[hit.face],
         ),
     )

@@ -1,6 +1,7 @@
 """Connectivity of triangle meshes, on the host: edges, loops, rings, colours."""
 
 import dataclasses
+import functools
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -24,12 +25,21 @@ class Edges:
 
 
 def mesh_edges(faces: Int[np.ndarray, "faces 3"]) -> Edges:
-    """The unique edges of a mesh and what lies beside them."""
-    f = np.asarray(faces, dtype=np.int64)
+    """The unique edges of a mesh and what lies beside them; not to be written to."""
+    return _mesh_edges(np.asarray(faces, dtype=np.int64).tobytes())
+
+
+# The same few meshes are asked about again and again.
+@functools.lru_cache(maxsize=8)
+def _mesh_edges(faces: bytes) -> Edges:
+    f = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
     # Column k holds the edge opposite to corner k.
     halves = np.stack([f[:, [1, 2]], f[:, [2, 0]], f[:, [0, 1]]], axis=1)
     flat = np.sort(halves.reshape(-1, 2), axis=1)
-    unique, inverse = np.unique(flat, axis=0, return_inverse=True)
+    # One number an edge: sorted many times as fast as pairs.
+    size = int(f.max(initial=0)) + 1
+    code, inverse = np.unique(flat[:, 0] * size + flat[:, 1], return_inverse=True)
+    unique = np.stack([code // size, code % size], axis=1)
     inverse = inverse.reshape(-1)
     order = np.argsort(inverse, kind="stable")
     count = np.bincount(inverse, minlength=len(unique))
@@ -38,12 +48,10 @@ def mesh_edges(faces: Int[np.ndarray, "faces 3"]) -> Edges:
     beside[:, 0] = order[start] // 3
     two = count >= 2
     beside[two, 1] = order[start[two] + 1] // 3
-    return Edges(
-        unique.astype(np.int32),
-        inverse.reshape(-1, 3).astype(np.int32),
-        beside.astype(np.int32),
-        count.astype(np.int32),
-    )
+    found = [x.astype(np.int32) for x in (unique, inverse.reshape(-1, 3), beside, count)]
+    for x in found:
+        x.flags.writeable = False
+    return Edges(*found)
 
 
 def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " n"]]:

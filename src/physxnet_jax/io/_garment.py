@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -118,7 +119,7 @@ def load_garment(
     moved, inside = lift_out(mesh, v, raw.faces, NEAREST)
     near = nearby_faces(skin, np.asarray(mesh.faces), moved, neighbours=12)
     points = jnp.asarray(moved.astype(np.float32))
-    hit = closest_among(mesh, points, jnp.asarray(near))
+    hit = jax.jit(closest_among)(mesh, points, jnp.asarray(near))
     refs = mesh.faces[hit.face]
     foot = jnp.einsum("vk,vkc->vc", hit.weights, rest[refs])
     weights = np.asarray(carried_weights(body.weights, refs, hit.weights))
