@@ -5,8 +5,9 @@ Cost:    about 40 minutes on two cores for all methods (penetration and the simu
          of it); goes on where it was stopped.
 Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png;
          datasets.json; the tables between the marks of docs/reproduction.md,
-         docs/accuracy-cost.md and README.md, with those of ablations.py, unseen.py,
-         bench_peers.py, bench_engines.py, bench_training.py and `physxnet bench net`; and
+         docs/accuracy-cost.md, docs/stability.md and README.md, with those of ablations.py,
+         unseen.py, bench_peers.py, bench_engines.py, bench_training.py and `physxnet bench
+         net`; and
          the measured table in the cards of the packaged weights. Datasets are built by
          `physxnet dataset build`, weights trained by `physxnet train`, both from
          experiments/configs.
@@ -100,7 +101,14 @@ def main() -> None:
         path = RESULTS / f"{name}.md"
         if path.is_file():
             blocks[name] = path.read_text()
-    documents = ("docs/reproduction.md", "docs/accuracy-cost.md", "docs/garments.md", "README.md")
+    documents = (
+        "docs/reproduction.md",
+        "docs/accuracy-cost.md",
+        "docs/garments.md",
+        "docs/stability.md",
+        "README.md",
+    )
+    blocks["stress"] = stress_table()
     for path in (ROOT / name for name in documents if (ROOT / name).is_file()):
         text = path.read_text()
         for name, block in blocks.items():
@@ -112,6 +120,19 @@ def main() -> None:
     for name in NETWORKS:
         note_measured(name, rows)
     write_ladder(rows)
+
+
+def stress_table() -> str:
+    """Hard cases of the simulator, with what other engines give where they can run them."""
+    lines = ["| case | measured | bound | here | Blender | Newton |", "|---|---|---|---|---|---|"]
+    last = ""
+    for r in json.loads((RESULTS / "stress.json").read_text()):
+        values = [f"{r[k]:.3g}" if k in r else "" for k in ("measured", "blender", "newton")]
+        case = r["case"].replace("_", " ") if r["case"] != last else ""
+        told = [case, r["quantity"], f"{r['bound']:g}", *values]
+        lines.append(f"| {' | '.join(told)} |")
+        last = r["case"]
+    return "\n".join(lines)
 
 
 def write_ladder(rows: list[ActionError]) -> None:

@@ -11,7 +11,7 @@ import pytest
 from physxnet_jax.cli import parse
 from physxnet_jax.data import DatasetConfig, read_protocol
 from physxnet_jax.dressing import dress, load_scene
-from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
+from physxnet_jax.evaluation import CASES, ActionError, error_tables, means, summary_table
 from physxnet_jax.garment import FABRICS, TEMPLATES
 from physxnet_jax.io import list_weights, read_card
 from physxnet_jax.motion import read_joint_map
@@ -41,6 +41,15 @@ def test_every_command_is_understood(name, monkeypatch):
     lines = re.findall(r"^(?:\.venv/bin/)?physxnet (.*?)(?: *#.*)?$", text, re.M)
     for line in lines:
         parse(shlex.split(line))
+
+
+def test_each_pain_has_a_command_that_is_one():
+    rows = (ROOT / "docs/pains.md").read_text().partition("|---|---|---|\n")[2].splitlines()
+    assert len(rows) == 15
+    for row in rows:
+        command = row.rstrip(" |").rpartition("| ")[2]
+        assert command.startswith("`physxnet ") and command.endswith("`"), row
+        parse(shlex.split(command.strip("`"))[1:])
 
 
 def test_every_link_leads_somewhere():
@@ -121,6 +130,17 @@ def test_blender_saw_what_is_told():
     measured = (ROOT / "experiments/results/blender_import.md").read_text()
     assert block and block.group(1) == measured
     assert all(float(x) < 1e-5 for x in re.findall(r"\| (\d\.\de-\d+) \|", measured))
+
+
+def test_hard_cases_are_told_as_measured():
+    text = (ROOT / "docs/stability.md").read_text()
+    table = runpy.run_path(str(ROOT / "experiments/reproduce.py"))["stress_table"]()
+    assert f"<!-- begin stress -->\n{table}\n<!-- end stress -->" in text
+    rows = json.loads((ROOT / "experiments/results/stress.json").read_text())
+    assert {r["case"] for r in rows} == set(CASES)
+    assert all(r["holds"] and r["measured"] <= r["bound"] for r in rows)
+    for path in re.findall(r"`(tests/[\w/.]+)`", text):
+        assert (ROOT / path).is_file(), path
 
 
 def test_layers_are_told_as_measured():

@@ -38,6 +38,7 @@ if _TYPE_CHECKING:
         load_character as load_character,
         make_dresser as make_dresser,
         start_clothing as start_clothing,
+        with_shape as with_shape,
     )
     from .errors import PhysXNetError as PhysXNetError
     from .garment import Fabric as Fabric, Garment as Garment, template as template
@@ -72,6 +73,7 @@ _ROOMS = {
         "load_character",
         "make_dresser",
         "start_clothing",
+        "with_shape",
     ),
     "errors": ("PhysXNetError",),
     "garment": ("Fabric", "Garment", "template"),
@@ -115,6 +117,7 @@ __all__ = [
     "simulate",
     "start_clothing",
     "template",
+    "with_shape",
     "write_clip",
 ]
 

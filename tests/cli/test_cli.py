@@ -2,13 +2,15 @@
 
 import json
 import pathlib
+import shlex
 
 import numpy as np
 import pytest
 
 from physxnet_jax._environment import check_jaxlib, jaxlib_problem
 from physxnet_jax.cli import main
-from physxnet_jax.errors import BrokenInstallError, MotionError
+from physxnet_jax.cli._main import _COMMANDS, parse
+from physxnet_jax.errors import BrokenInstallError, MotionError, PhysXNetError
 from physxnet_jax.garment import template
 from physxnet_jax.io import load_garment, read_obj, write_obj
 
@@ -94,6 +96,8 @@ def test_dress_writes_and_reports(tmp_path, capsys, method):
         (["dress", "walk", "--shape", "gender=nan"], "from 0 to 1"),
         (["dress", "walk", "--weights", "none"], "local"),
         (["dress", "walk", "--frames", "0"], "at least one"),
+        (["inspect"], "name one"),
+        (["fit", "a.obj", "-o", "./a.obj"], "overwrite"),
         (
             ["dress", "walk", "--budget-ms", "5", "--max-error-mm", "9"],
             "either a time (--budget-ms)",
@@ -105,6 +109,46 @@ def test_errors_are_one_sentence_and_exit_code_two(capsys, words, says):
     error = capsys.readouterr().err
     assert error.startswith("physxnet: ") and says in " ".join(error.split())
     assert "Traceback" not in error
+
+
+@pytest.mark.parametrize("command", list(_COMMANDS))
+def test_help_shows_examples_that_are_commands(command, capsys):
+    with pytest.raises(SystemExit) as left:
+        main([command, "--help"])
+    assert left.value.code == 0
+    said = capsys.readouterr().out
+    examples = [x.strip() for x in said.splitlines() if x.startswith(f"  physxnet {command}")]
+    assert "Examples:" in said and examples
+    for line in examples:
+        assert isinstance(parse(shlex.split(line)[1:]), _COMMANDS[command]), line
+
+
+def test_the_list_of_commands_shows_no_examples(capsys):
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    said = capsys.readouterr().out
+    assert "Examples" not in said and all(f" {name} " in said for name in _COMMANDS)
+
+
+def test_a_stop_by_hand_says_what_is_left_and_debug_shows_the_trace(monkeypatch, capsys):
+    def stopped(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("physxnet_jax.cli._main._run", stopped)
+        assert main(["dress", "walk"]) == 130
+        assert "nothing half-written" in capsys.readouterr().err
+        assert main(["simulate", "walk"]) == 130
+        assert "kept for the next run" in capsys.readouterr().err
+    with pytest.raises(PhysXNetError, match="built-in clip"):
+        main(["dress", "wlak", "--debug"])
+
+
+def test_shells_complete_the_commands(capsys):
+    with pytest.raises(SystemExit):
+        main(["--tyro-print-completion", "bash"])
+    said = capsys.readouterr().out
+    assert "physxnet" in said and all(name in said for name in _COMMANDS)
 
 
 def test_a_joint_map_reaches_the_reader(tmp_path, capsys):

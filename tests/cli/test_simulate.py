@@ -161,6 +161,13 @@ def test_a_stopped_rollout_goes_on_and_ends_the_same(tmp_path):
     assert len(list(keep.glob("block_*.npz"))) == 2
     with pytest.raises(SimulationError, match="another scene"):
         simulate_batch(scene, [motion], solver=XPBD(16, 2), resume=keep)
+    last = max(keep.glob("block_*.npz"))
+    blob = last.read_bytes()
+    for bad in (blob[: len(blob) // 2], b"", b"never"):
+        last.write_bytes(bad)
+        with pytest.raises(SimulationError, match=r"block_00001\.npz: damaged"):
+            simulate_batch(scene, [motion], solver=solver, resume=keep)
+    last.write_bytes(blob)
     again = []
     rest = simulate_batch(
         scene, [motion], solver=solver, progress=lambda d, t: again.append(d), resume=keep

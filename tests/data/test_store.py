@@ -262,6 +262,21 @@ def test_what_is_left_of_a_clip_begins_after_the_longest_action(tmp_path):
     assert [a.start for a in found] == [10.0, 10.0]
 
 
+@pytest.mark.parametrize(
+    "row",
+    ["train,walk,a.bvh,soon,34", "train,walk,a.bvh", "train,walk,a.bvh,0.0,3.5"],
+    ids=["words", "short", "half a frame"],
+)
+def test_a_row_that_is_none_is_named(tmp_path, row):
+    head = "split,action,file,start_s,frames_at_30fps"
+    (tmp_path / "ACTIONS.csv").write_text(f"{head}\ntrain,run,b.bvh,0.0,30\n{row}\n")
+    with pytest.raises(MotionError, match=r"ACTIONS\.csv:3: not a row"):
+        read_protocol(tmp_path)
+    (tmp_path / "ACTIONS.csv").write_text("name,file\nwalk,a.bvh\n")
+    with pytest.raises(MotionError, match="split"):
+        read_protocol(tmp_path)
+
+
 def test_a_missing_protocol_is_named(tmp_path):
     with pytest.raises(MotionError, match=r"ACTIONS\.csv"):
         read_protocol(tmp_path)

@@ -17,8 +17,10 @@ from physxnet_jax.dressing import (
     export_dresser,
     make_dresser,
     start_clothing,
+    with_shape,
 )
 from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.models import PAPER
 from physxnet_jax.motion import load_motion
 
 FRAMES = 6
@@ -66,6 +68,56 @@ def test_people_are_batched_by_vmap(dresser, whole, motion):
     np.testing.assert_allclose(np.asarray(out[0]), np.asarray(whole["bottom"]), atol=1e-5)
     moved = np.asarray(out[1]) - np.array([1.0, 0.0, 2.0], np.float32)
     np.testing.assert_allclose(moved, np.asarray(whole["bottom"]), atol=1e-4)
+
+
+@pytest.fixture(scope="module")
+def shapes(dresser):
+    body = dresser.body
+    return jnp.stack([body.shape(weight_up=0.6), body.default_shape(), body.shape(height_up=0.5)])
+
+
+def test_clothes_follow_the_shape_as_if_made_for_it(dresser, shapes, motion):
+    """Without push-out exactly; with it up to which skin is compared."""
+    for resolve, near in ((False, 1e-5), (True, 2e-3)):
+        mine = dataclasses.replace(dresser, resolve=resolve)
+        made = make_dresser(["bottom"], shape=shapes[0], resolve=resolve)
+        run = jax.jit(lambda d: clothe(d, *motion, 30.0)["bottom"])
+        moved, wanted, before = run(with_shape(mine, shapes[0])), run(made), run(mine)
+        assert float(jnp.abs(moved - wanted).max()) < near
+        assert float(jnp.linalg.norm(before - wanted, axis=2).mean()) > 2e-3, "another shape"
+
+
+def test_shapes_are_batched_and_differentiated(dresser, shapes, motion):
+    """A crowd by vmap is one after the other; the slope by a parameter is the difference's."""
+
+    @jax.jit
+    def cloth(shape):
+        person = with_shape(dataclasses.replace(dresser, resolve=False), shape)
+        return clothe(person, *motion, 30.0)["bottom"]
+
+    crowd = jax.jit(jax.vmap(cloth))(shapes)
+    for k, shape in enumerate(shapes):
+        np.testing.assert_allclose(np.asarray(crowd[k]), np.asarray(cloth(shape)), atol=1e-5)
+
+    def girth(shape):
+        return jnp.mean(cloth(shape)[..., 2] ** 2)
+
+    at = shapes[0]
+    way = shapes[0] - shapes[1]
+    slope = float(jax.jit(jax.grad(girth))(at) @ way)
+    step = 0.05
+    ends = [float(girth(at + s * way)) for s in (step, -step)]
+    assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.03)
+    assert abs(slope) > 1e-5
+
+
+def test_the_shape_of_a_dress_by_the_papers_network_is_refused(dresser):
+    config = dataclasses.replace(dresser.predictor.config, inputs=PAPER)
+    wearables = (dataclasses.replace(dresser.wearables[0], template="dress"),)
+    predictor = dataclasses.replace(dresser.predictor, config=config)
+    skirt = dataclasses.replace(dresser, predictor=predictor, wearables=wearables)
+    with pytest.raises(ValueError, match="make_dresser"):
+        with_shape(skirt, dresser.body.default_shape())
 
 
 def test_the_root_pulls_the_cloth_along(dresser, motion):

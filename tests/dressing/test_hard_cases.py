@@ -75,12 +75,18 @@ def far_away(q, p):
     return q, p + jnp.array([[3e3, 0.0, -3e3]])
 
 
+def gliding(q, p):
+    """One pose carried along at one speed: every map stays what it is."""
+    q, p = still(q, p)
+    return q, p + jnp.linspace(0.0, 0.5, FRAMES)[:, None] * jnp.array([[1.0, 0.0, 0.0]])
+
+
 def mirrored_quaternions(q, p):
     """q and -q are the same rotation."""
     return jnp.where(jnp.arange(FRAMES)[:, None, None] % 2 == 0, q, -q), p
 
 
-@pytest.mark.parametrize("case", [still, teleport, fast, far_away, mirrored_quaternions])
+@pytest.mark.parametrize("case", [still, gliding, teleport, fast, far_away, mirrored_quaternions])
 def test_cloth_stays_near_and_differentiable(judge, motion, case):
     value, out, grads, tangent = judge(*case(*motion))
     assert np.isfinite(value) and np.isfinite(tangent)
@@ -105,6 +111,18 @@ def test_standing_still_is_a_fixed_point(judge, motion):
     del out["ok"]
     for x in out.values():
         np.testing.assert_allclose(np.asarray(x), np.asarray(x[:1]).repeat(FRAMES, 0), atol=1e-6)
+
+
+def test_an_even_glide_is_a_fixed_point_once_the_window_is_full(dresser, judge, motion):
+    """Constant maps in, constant cloth out, seen from the person."""
+    _, out, _, _ = judge(*gliding(*motion))
+    _, stood, _, _ = judge(*still(*motion))
+    del out["ok"]
+    full = dresser.predictor.config.inputs.window - 1
+    for name, x in out.items():
+        x = np.asarray(x)
+        np.testing.assert_allclose(x[full:], x[full:][:1].repeat(FRAMES - full, 0), atol=1e-5)
+        assert np.abs(x[-1] - np.asarray(stood[name])[-1]).max() > 1e-4, "speed is seen"
 
 
 def test_signs_of_quaternions_change_nothing(judge, motion):

@@ -269,6 +269,11 @@ def test_states_of_steps_to_be_done_again_are_forgotten(tmp_path):
     kept.forget_after(4)
     kept.save(at(4), {})
     assert int(kept.latest(at(0)).step) == 4
+    for file in (tmp_path / "best/4").rglob("*"):
+        if file.is_file() and "state" in str(file.relative_to(tmp_path)):
+            file.write_bytes(b"never")
+    with pytest.raises(PhysXNetError, match="is damaged"):
+        kept.latest(at(0))
     kept.close()
 
 

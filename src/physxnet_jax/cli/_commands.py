@@ -136,7 +136,11 @@ class Rest:
 
 @dataclasses.dataclass(frozen=True)
 class Demo:
-    """Dress a built-in walk: writes demo.usdc, demo.mp4 and demo.png."""
+    """Dress a built-in walk: writes demo.usdc, demo.mp4 and demo.png.
+
+    Examples:
+      physxnet demo --out out
+    """
 
     out: pathlib.Path = pathlib.Path("out")
     """Folder to write to."""
@@ -150,7 +154,12 @@ class Demo:
 
 @dataclasses.dataclass(frozen=True)
 class Doctor:
-    """Print versions, devices and optional parts; refuse a jaxlib that miscomputes."""
+    """Print versions, devices and optional parts; refuse a jaxlib that miscomputes.
+
+    Examples:
+      physxnet doctor
+      physxnet doctor --json
+    """
 
     json: bool = False
     """Print JSON for machines instead of tables."""
@@ -178,7 +187,12 @@ class Calibrate:
 
 @dataclasses.dataclass(frozen=True)
 class Clips:
-    """List the built-in clips, templates and weights."""
+    """List the built-in clips, templates and weights.
+
+    Examples:
+      physxnet clips
+      physxnet clips --json
+    """
 
     json: bool = False
     """Print JSON for machines instead of tables."""

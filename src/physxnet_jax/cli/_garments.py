@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ..body import load_body
+from ..errors import MeshError
 from ..garment import template
 from ..io import Inspection, fit_garment, inspect_garment, write_obj
 from ._commands import Fit, Inspect, Rest
@@ -18,6 +19,8 @@ from ._progress import print_json
 
 def inspect(command: Inspect, console: Console) -> int:
     """Shows every file; 1 if one of them needs mending."""
+    if not command.files:
+        raise MeshError("no file to look at: name one, as in `physxnet inspect my_shirt.obj`.")
     found = []
     for file in command.files:
         found.append(inspect_garment(file))

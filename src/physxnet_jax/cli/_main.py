@@ -3,7 +3,8 @@
 import pathlib
 import sys
 from collections.abc import Sequence
-from typing import Annotated, Any
+from inspect import cleandoc
+from typing import Annotated, Any, Union
 
 import tyro
 from rich.console import Console
@@ -27,25 +28,25 @@ from ._doctor import doctor
 from ._experiment_commands import Bench, Dataset, Evaluate, Stress, Train
 from ._progress import print_json, progress_bars
 
-_Command = (
-    Annotated[Dress, tyro.conf.subcommand("dress")]
-    | Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Doctor, tyro.conf.subcommand("doctor")]
-    | Annotated[Clips, tyro.conf.subcommand("clips")]
-    | Annotated[Simulate, tyro.conf.subcommand("simulate")]
-    | Annotated[Effects, tyro.conf.subcommand("effects")]
-    | Annotated[Bench, tyro.conf.subcommand("bench")]
-    | Annotated[Stress, tyro.conf.subcommand("stress")]
-    | Annotated[Dataset, tyro.conf.subcommand("dataset")]
-    | Annotated[Train, tyro.conf.subcommand("train")]
-    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
-    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
-    | Annotated[Export, tyro.conf.subcommand("export")]
-    | Annotated[Inspect, tyro.conf.subcommand("inspect")]
-    | Annotated[Fit, tyro.conf.subcommand("fit")]
-    | Annotated[Rest, tyro.conf.subcommand("rest")]
-    | Annotated[View, tyro.conf.subcommand("view")]
-)
+_COMMANDS: dict[str, type] = {
+    "dress": Dress,
+    "demo": Demo,
+    "doctor": Doctor,
+    "clips": Clips,
+    "simulate": Simulate,
+    "effects": Effects,
+    "bench": Bench,
+    "stress": Stress,
+    "dataset": Dataset,
+    "train": Train,
+    "evaluate": Evaluate,
+    "calibrate": Calibrate,
+    "export": Export,
+    "inspect": Inspect,
+    "fit": Fit,
+    "rest": Rest,
+    "view": View,
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,8 +81,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def parse(arguments: Sequence[str] | None = None) -> Any:
     """The command that words on a command line mean, not run; leaves if they mean none."""
+    words = sys.argv[1:] if arguments is None else arguments
+    asked = words[0] if words else ""
+    # Examples are shown for the command that is asked about; in the list of all a line is enough.
+    kinds = [
+        Annotated[
+            kind,
+            tyro.conf.subcommand(
+                name, description=cleandoc(kind.__doc__ or "") if name == asked else None
+            ),
+        ]
+        for name, kind in _COMMANDS.items()
+    ]
     return tyro.cli(
-        _Command,  # pyright: ignore[reportArgumentType]
+        Union[tuple(kinds)],  # noqa: UP007  # pyright: ignore
         prog="physxnet",
         args=arguments,
         config=(tyro.conf.OmitSubcommandPrefixes,),

@@ -5,6 +5,8 @@ import dataclasses
 import itertools
 import pathlib
 import re
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 
@@ -12,6 +14,7 @@ from ..errors import MotionError
 from ..motion import Motion, load_motion, sample
 
 FPS = 30.0
+_Row = TypeVar("_Row")
 # Frames of what is left of a clip: two seconds at least, about as much as two actions at most.
 _SHORTEST, _LONGEST = 60, 400
 _HOW = (
@@ -46,6 +49,23 @@ class Action:
         return re.sub(r"[^a-z0-9]+", "_", self.name.lower()).strip("_")
 
 
+def _rows(path: pathlib.Path, read: Callable[[dict[str, str]], _Row]) -> list[_Row]:
+    out = []
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        lines = csv.DictReader(file)
+        for row in lines:
+            try:
+                out.append(read(row))
+            except (KeyError, TypeError, ValueError) as error:
+                raise MotionError.at(
+                    path,
+                    lines.line_num,
+                    f"not a row of the protocol ({type(error).__name__}: {error})",
+                    _HOW,
+                ) from None
+    return out
+
+
 def read_protocol(folder: str | pathlib.Path) -> list[Action]:
     """The actions listed in ``ACTIONS.csv``, with true rates from ``CLIPS.csv``.
 
@@ -53,7 +73,7 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
         folder: Where both tables and the motion files lie.
 
     Raises:
-        MotionError: No table there.
+        MotionError: No table there, or one without its columns and numbers.
     """
     folder = pathlib.Path(folder)
     table = folder / "ACTIONS.csv"
@@ -62,20 +82,18 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
     rates: dict[str, float] = {}
     clips = folder / "CLIPS.csv"
     if clips.is_file():
-        with clips.open(newline="") as file:
-            rates = {row["file"]: float(row["fps"]) for row in csv.DictReader(file)}
-    with table.open(newline="") as file:
-        actions = [
-            Action(
-                row["split"],
-                row["action"],
-                row["file"],
-                float(row["start_s"]),
-                int(row["frames_at_30fps"]),
-                rates.get(row["file"]),
-            )
-            for row in csv.DictReader(file)
-        ]
+        rates = dict(_rows(clips, lambda row: (row["file"], float(row["fps"]))))
+    actions = _rows(
+        table,
+        lambda row: Action(
+            row["split"],
+            row["action"],
+            row["file"],
+            float(row["start_s"]),
+            int(row["frames_at_30fps"]),
+            rates.get(row["file"]),
+        ),
+    )
     seen: dict[str, str] = {}
     for action in actions:
         if not action.slug or action.slug in seen:

@@ -29,6 +29,7 @@ from ._dresser import (
     clothe_frame as clothe_frame,
     make_dresser as make_dresser,
     start_clothing as start_clothing,
+    with_shape as with_shape,
 )
 from ._export import EXPORTED as EXPORTED, export_dresser as export_dresser
 from ._ladder import (

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..body import Body, load_body
+from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..garment import Garment
+from ..geometry import vertex_normals
 from ..io import DEFAULT, load_garment, load_predictor
 from ..models import (
     Predictor,
@@ -44,8 +45,8 @@ class Dresser:
         wearables: What is worn.
         patches: The skin that each garment is pushed out of.
         layers: Which garments lie over which, innermost first.
-        faces: Triangles of each garment, shape [faces, 3].
-        resolve: Whether it is.
+        garments: The same at rest on the body's default shape, and what carries them.
+        resolve: Whether vertices inside the body are moved out of it.
     """
 
     body: Body
@@ -54,8 +55,13 @@ class Dresser:
     wearables: tuple[Wearable, ...]
     patches: tuple[SkinPatch, ...]
     layers: tuple[Layer, ...]
-    faces: tuple[Int[Array, "faces 3"], ...]
+    garments: tuple[Garment, ...]
     resolve: bool = dataclasses.field(metadata={"static": True})
+
+    @property
+    def faces(self) -> tuple[Int[Array, "faces 3"], ...]:
+        """Triangles of each garment, shape [faces, 3]."""
+        return tuple(g.mesh.faces for g in self.garments)
 
 
 @pytree
@@ -120,9 +126,53 @@ def make_dresser(
         [make_patch(body, rest, w, g.mesh) for w, g in zip(wearables, garments, strict=True)],
         wearables,
     )
-    faces = tuple(jnp.asarray(g.mesh.faces) for g in garments)
     layers = make_layers(body, rest, wearables, garments)
-    return Dresser(body, rest, predictor, wearables, patches, layers, faces, resolve)
+    return Dresser(body, rest, predictor, wearables, patches, layers, tuple(garments), resolve)
+
+
+def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
+    """The same clothes on a body of another shape; pure, for `jax.vmap` and `jax.grad` by it.
+
+    Garments follow the shape as `Garment.rest_vertices` carries them. Without push-out it
+    is what `make_dresser` gives for the shape; push-out compares the skin that was near on
+    the shape before.
+
+    Args:
+        dresser: From `make_dresser`.
+        shape: Shape parameters, see `Body.shape`.
+
+    Raises:
+        ValueError: A dress by a network of the paper's family, whose offsets begin on a
+            body with joined legs; make a dresser for the shape instead.
+
+    Example:
+        >>> person = make_dresser(["bottom"])
+        >>> tall = with_shape(person, person.body.shape(height_up=0.5))
+        >>> bool(tall.wearables[0].rest[:, 1].max() > person.wearables[0].rest[:, 1].max())
+        True
+    """
+    body, predictor = dresser.body, dresser.predictor
+    skirts = any(w.template == "dress" for w in dresser.wearables)
+    if skirts and predictor.config.family == "paper":
+        raise ValueError("dresses of the paper's family: use make_dresser(..., shape=shape).")
+    rest = body.rest_vertices(shape)
+    surface = dataclasses.replace(predictor.surface, rest=predictor.atlas.to_body @ rest)
+    wearables = tuple(
+        dataclasses.replace(w, rest=g.rest_vertices(rest), anchor=w.binding.to_body @ rest)
+        for w, g in zip(dresser.wearables, dresser.garments, strict=True)
+    )
+    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
+    normals = vertex_normals(mesh.vertices, mesh.faces)
+    patches = tuple(
+        dataclasses.replace(p, rest=rest[p.used], normals=normals[p.used]) for p in dresser.patches
+    )
+    return dataclasses.replace(
+        dresser,
+        rest=rest,
+        predictor=dataclasses.replace(predictor, surface=surface),
+        wearables=wearables,
+        patches=patches,
+    )
 
 
 def clothe(

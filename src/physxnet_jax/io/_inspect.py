@@ -187,12 +187,15 @@ def fit_garment(
 
     Raises:
         FormatError: A file that can't be read.
-        MeshError: No unit and axis puts it on the body, and ``like`` isn't given.
+        MeshError: No unit and axis puts it on the body, and ``like`` isn't given; ``out``
+            is the file itself.
         MissingDependencyError: Decimation without fast-simplification.
     """
     path, out = pathlib.Path(path), pathlib.Path(out)
     if out.suffix.lower() != ".obj":
         raise MeshError(f"{out}: garments are written as .obj.")
+    if out.resolve() == path.resolve():
+        raise MeshError(f"{out}: would overwrite the file it is made from. Name another one.")
     body = load_body() if body is None else body
     raw = read_obj(path)
     skin = body.rest_mesh()

@@ -3,6 +3,8 @@
 import contextlib
 import hashlib
 import pathlib
+import zipfile
+import zlib
 from typing import Any
 
 import jax
@@ -44,14 +46,26 @@ class Resume:
             part.write_text(key)
 
     def load(self, state: Any) -> tuple[Any, list[np.ndarray], list[dict[str, np.ndarray]]]:
-        """The last state (of the given structure), positions and diagnostics of blocks."""
+        """The last state (of the given structure), positions and diagnostics of blocks.
+
+        Raises:
+            SimulationError: A damaged block.
+        """
         positions, diagnostics = [], []
         leaves, tree = jax.tree.flatten(state)
-        while self._path(len(positions)).is_file():
-            with np.load(self._path(len(positions))) as data:
-                positions.append(data["positions"])
-                diagnostics.append({k[5:]: data[k] for k in data.files if k.startswith("info_")})
-                leaves = [jnp.asarray(data[f"state_{i}"]) for i in range(len(leaves))]
+        while (path := self._path(len(positions))).is_file():
+            try:
+                with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+                    moved = data["positions"]
+                    info = {k[5:]: data[k] for k in data.files if k.startswith("info_")}
+                    leaves = [jnp.asarray(data[f"state_{i}"]) for i in range(len(leaves))]
+            except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+                raise SimulationError(
+                    f"{path}: damaged ({type(error).__name__}). Delete it and those after it: the"
+                    " rollout goes on from the block before."
+                ) from None
+            positions.append(moved)
+            diagnostics.append(info)
         return jax.tree.unflatten(tree, leaves), positions, diagnostics
 
     def save(

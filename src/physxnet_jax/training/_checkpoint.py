@@ -56,14 +56,25 @@ class Checkpoints:
                 self._manager.delete(later)
 
     def latest(self, like: TrainState) -> TrainState | None:
-        """The newest state, shaped as ``like``; None if there is none."""
+        """The newest state, shaped as ``like``; None if there is none.
+
+        Raises:
+            PhysXNetError: A damaged one.
+        """
         step = self._manager.latest_step()
         if step is None:
             return None
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, _plain(like))
-        got = self._manager.restore(
-            step, args=ocp.args.Composite(state=ocp.args.StandardRestore(abstract))
-        )
+        wanted = ocp.args.Composite(state=ocp.args.StandardRestore(abstract))
+        try:
+            got = self._manager.restore(step, args=wanted)
+        # Files are read by several libraries, each with errors of its own.
+        except Exception as error:
+            raise PhysXNetError(
+                f"{self._manager.directory}/{step}: the state there is damaged"
+                f" ({type(error).__name__}). Delete that folder: the run goes on from the one"
+                " before."
+            ) from error
         return jax.tree.unflatten(jax.tree.structure(like), got["state"])
 
     def close(self) -> None:
