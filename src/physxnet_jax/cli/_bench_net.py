@@ -60,12 +60,12 @@ def bench_net(command: Bench, console: Console) -> int:
             ]
             if command.times:
                 # Errors don't change; a method without any isn't measured anew.
-                errors = {(r.method, r.garments): r.rmse_mm for r in known}
+                errors = {(r.method, r.garments): (r.rmse_mm, r.rmse_each) for r in known}
                 again = _measure(kind, size, precision, command, []) if known else ()
-                rows = [r for r in rows if r not in known] + [
-                    dataclasses.replace(r, rmse_mm=errors.get((r.method, r.garments), math.nan))
-                    for r in again
-                ]
+                rows = [r for r in rows if r not in known]
+                for r in again:
+                    mean, each = errors.get((r.method, r.garments), (math.nan, {}))
+                    rows.append(dataclasses.replace(r, rmse_mm=mean, rmse_each=each))
             elif not known:
                 rows += list(_measure(kind, size, precision, command, tests))
             if command.out is not None:
@@ -155,6 +155,7 @@ _COLUMNS = (
     "garments",
     "batch",
     "RMSE mm",
+    "of each",
     "ms a frame",
     "network ms",
     "gradient ms",
@@ -177,6 +178,7 @@ def markdown(rows: list[Cost]) -> str:
             str(r.garments),
             str(r.batch),
             _number(r.rmse_mm, ".1f"),
+            " / ".join(f"{x:.1f}" for x in r.rmse_each.values()) if r.garments > 1 else "",
             f"{r.ms_per_frame:.2f}",
             f"{r.ms_network:.2f}" if r.ms_network else "",
             _number(r.ms_backward, ".1f"),

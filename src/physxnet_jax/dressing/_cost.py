@@ -49,6 +49,7 @@ class Cost:
         peak_mb: Memory of a call: arguments, results and what is between [MB].
         backward_mb: The same of the gradient.
         precision: Of the network's arithmetic.
+        rmse_each: The error of each garment worn by template [mm], where there is data.
     """
 
     method: str
@@ -67,6 +68,7 @@ class Cost:
     ms_backward: float = math.nan
     backward_mb: float = math.nan
     precision: str = "float32"
+    rmse_each: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
 def network_costs(
@@ -104,7 +106,7 @@ def network_costs(
             dresser = make_dresser(
                 worn[:number], weights=predictor, resolve=resolve, precision=precision
             )
-            known = [errors.get(method, {}).get(t, float("nan")) for t in worn[:number]]
+            known = errors.get(method, {})
             for batch in batches:
                 yield Cost(
                     method,
@@ -112,14 +114,23 @@ def network_costs(
                     jax.devices()[0].device_kind,
                     batch,
                     number,
-                    statistics.fmean(known),
+                    _mean(known, worn[:number]),
                     **_clothing(dresser, motion, batch),
                     **(_gradient(dresser, motion, batch) if backward else {}),
                     ms_network=_network(dresser, batch),
                     params=params,
                     weights_mb=weights_size(weights) / 1e6,
                     precision=precision,
+                    rmse_each=_each(known, worn[:number]),
                 )
+
+
+def _each(errors: Mapping[Template, float], worn: Items[Template]) -> dict[str, float]:
+    return {t: round(errors[t], 3) for t in worn if t in errors}
+
+
+def _mean(errors: Mapping[Template, float], worn: Items[Template]) -> float:
+    return statistics.fmean(errors.get(t, math.nan) for t in worn)
 
 
 def other_costs(
@@ -148,14 +159,13 @@ def other_costs(
         began = time.perf_counter()
         times.append(method(motion, t).ms_per_frame)
         colds.append(time.perf_counter() - began)
-        known = [errors.get(x, nan) for x in worn[: len(times)]]
         yield Cost(
             kind,
             size,
             jax.devices()[0].device_kind,
             BLOCK if kind == "lbs" else 1,
             len(times),
-            statistics.fmean(known),
+            _mean(errors, worn[: len(times)]),
             sum(times),
             0.0,
             sum(colds),
@@ -163,6 +173,7 @@ def other_costs(
             nan,
             0.0,
             nan,
+            rmse_each=_each(errors, worn[: len(times)]),
         )
 
 
