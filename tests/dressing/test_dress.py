@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from physxnet_jax.dressing import dress, pushed_network
+from physxnet_jax.dressing._blocks import dress_block
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.evaluation import network
 from physxnet_jax.garment import template
@@ -36,6 +37,15 @@ def test_the_network_moves_cloth_away_from_skinning_but_stays_near_the_body():
     height = a.garments[1].positions[:, hem, 1].mean(axis=1) - hips
     assert np.abs(np.diff(height)).max() < 0.025 and np.ptp(height) > 0.02
     assert {s.name for s in a.stages} >= {"motion", "binding", "network", "body"}
+
+
+def test_another_clip_of_another_length_compiles_nothing():
+    dress("walk", ["bottom"], method="lbs", frames=3)
+    programs = dress_block._cache_size()
+    dress("punch", ["bottom"], method="lbs", frames=40)
+    assert dress_block._cache_size() == programs
+    dress("walk", ["bottom"], method="lbs", frames=3, resolve=False)
+    assert dress_block._cache_size() == programs + 1, "another program is one more"
 
 
 def test_the_simulation_is_what_its_own_rollout_says():
