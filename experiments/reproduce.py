@@ -63,6 +63,8 @@ SETS = {
     "swift": "legs of all with upper bodies of yet others, a quarter faster",
     "varied_left_out": "the left out with upper bodies of yet others, slower and wider still",
     "slow": "training actions at 0.8 of their speed",
+    "taught_a": "answered by networks: legs of all with other upper bodies, slower and wider",
+    "taught_b": "answered by networks: legs of all with yet others, faster and wider",
     "blender": "protocol, Blender",
 }
 SOFT = ("moon walk", "balancing", "walking")
@@ -220,12 +222,12 @@ def note_measured(name: str, rows: list[ActionError]) -> None:
 
 
 def more_motion(rows: list[ActionError], more: list[ActionError]) -> str:
-    """One recipe with more motion, with another optimiser, and two networks' mean."""
+    """One recipe with more motion, another optimiser, networks as teachers, and two's mean."""
     lines = ["| asked | top, mm | bottom, mm | dress, mm |", "|---|---|---|---|"]
     asked = {
-        f"{name}{mirror}": more if name == "local-wide" else rows
+        f"{name}{mirror}": more if name in ("local-wide", "local-taught") else rows
         for mirror in ("", MIRROR)
-        for name in ("local", "local-wide", "local-muon", "pair")
+        for name in ("local", "local-wide", "local-muon", "local-taught", "pair")
     }
     for name, measured in asked.items():
         cells = []

@@ -1,0 +1,17 @@
+"""What three networks answer on motion that none has seen: legs of all with other upper bodies.
+
+Command: physxnet dataset build experiments/configs/dataset_taught_b.py --out runs/taught_b
+Cost:    see docs/reproduction.md, the dataset.
+Result:  cloth for one network to learn from that shall answer as three do; nothing is simulated.
+"""
+
+from physxnet_jax.data import DatasetConfig
+
+CONFIG = DatasetConfig(
+    engine="network",
+    splits=("train", "extra"),
+    upper_from=9,
+    exaggerate=1.3,
+    speed=1.1,
+    networks=("local+mirror", "local-muon+mirror", "runs/local-wide/weights+mirror"),
+)
