@@ -43,7 +43,7 @@ def clip():
 
 def test_usd_is_read_back_with_rate_axis_unit_uv_normals_and_velocities(tmp_path, clip):
     usd = pytest.importorskip("pxr.Usd")
-    from pxr import UsdGeom
+    from pxr import UsdGeom, UsdShade
 
     (path,) = write_clip(tmp_path / "a.usdc", clip, 24.0)
     stage = usd.Stage.Open(str(path))
@@ -58,6 +58,12 @@ def test_usd_is_read_back_with_rate_axis_unit_uv_normals_and_velocities(tmp_path
             np.testing.assert_allclose(
                 np.asarray(mesh.GetPointsAttr().Get(k)), m.positions[k], atol=1e-6
             )
+        np.testing.assert_allclose(mesh.GetDisplayColorAttr().Get()[0], m.colour, atol=1e-6)
+        material, _ = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()
+        shader = UsdShade.Shader(material.ComputeSurfaceSource()[0])
+        assert shader.GetIdAttr().Get() == "UsdPreviewSurface"
+        colour = shader.GetInput("diffuseColor").Get()
+        np.testing.assert_allclose(colour, m.colour, atol=1e-6)
         speed = np.asarray(mesh.GetVelocitiesAttr().Get(3))
         np.testing.assert_allclose(
             speed, 24 * (m.positions[3] - m.positions[2]), rtol=1e-4, atol=1e-4
