@@ -16,20 +16,6 @@ from physxnet_jax.dressing import (
     with_shape,
 )
 from physxnet_jax.models import Inputs
-from physxnet_jax.motion import load_motion
-
-FRAMES = 6
-
-
-@pytest.fixture(scope="module")
-def motion():
-    m = load_motion("punch", fps=30.0)
-    return m.rotations[8 : 8 + FRAMES], m.root[8 : 8 + FRAMES]
-
-
-@pytest.fixture(scope="module")
-def dresser():
-    return make_dresser(["bottom"])
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +43,7 @@ def judge(dresser):
 
 
 def still(q, p):
-    return q[:1].repeat(FRAMES, axis=0), p[:1].repeat(FRAMES, axis=0)
+    return q[:1].repeat(len(q), axis=0), p[:1].repeat(len(p), axis=0)
 
 
 def teleport(q, p):

@@ -26,11 +26,10 @@ class Edges:
 
 def mesh_edges(faces: Int[np.ndarray, "faces 3"]) -> Edges:
     """The unique edges of a mesh and what lies beside them; not to be written to."""
-    return _mesh_edges(np.asarray(faces, dtype=np.int64).tobytes())
+    find = _known_edges if len(faces) <= _REMEMBERED else _mesh_edges
+    return find(np.asarray(faces, dtype=np.int64).tobytes())
 
 
-# The same few meshes are asked about again and again.
-@functools.lru_cache(maxsize=8)
 def _mesh_edges(faces: bytes) -> Edges:
     f = np.frombuffer(faces, dtype=np.int64).reshape(-1, 3)
     # Column k holds the edge opposite to corner k.
@@ -52,6 +51,11 @@ def _mesh_edges(faces: bytes) -> Edges:
     for x in found:
         x.flags.writeable = False
     return Edges(*found)
+
+
+# The same few meshes are asked about again and again; large ones would fill the memory.
+_REMEMBERED = 200_000
+_known_edges = functools.lru_cache(maxsize=8)(_mesh_edges)
 
 
 def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " n"]]:
