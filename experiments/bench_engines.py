@@ -25,6 +25,7 @@ from rich.progress import Progress
 
 from physxnet_jax.body import load_body
 from physxnet_jax.dressing import dress, network_costs
+from physxnet_jax.evaluation import ENGINES
 from physxnet_jax.files import whole_file
 from physxnet_jax.garment import TEMPLATES, template
 from physxnet_jax.io import load_predictor
@@ -37,11 +38,8 @@ from physxnet_jax.simulation import (
     simulate_batch,
     standard_effects,
 )
-from physxnet_jax.simulation.blender import simulate_blender
-from physxnet_jax.simulation.newton import simulate_newton
 
 RESULTS = pathlib.Path(__file__).parent / "results"
-ENGINES = {"blender": simulate_blender, "newton": simulate_newton}
 
 
 def simulated(name: str, scene: Scene, motion: Motion) -> tuple[Rollout, float]:

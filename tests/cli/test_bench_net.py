@@ -10,7 +10,7 @@ from flax import nnx
 
 from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
-from physxnet_jax.cli._bench_net import floors, points
+from physxnet_jax.cli._bench_net import _place, _with_errors, engines, floors, points
 from physxnet_jax.data import Sequence
 from physxnet_jax.dressing import Cost, mean_errors
 from physxnet_jax.evaluation import skinning
@@ -134,3 +134,46 @@ def test_what_is_missing_is_said(tmp_path, capsys):
     assert "no 'test' actions" in capsys.readouterr().err
     assert main(["bench", "net", "--weights", "none", "--out", str(tmp_path / "a.json")]) == 2
     assert "none" in capsys.readouterr().err
+
+
+def test_an_engine_is_timed_and_drawn_without_an_error():
+    nan = float("nan")
+
+    def row(method, size, garments, error, **more):
+        more = {"ms_per_frame": 1.0, "batch": 1} | more
+        return Cost(
+            method=method,
+            size=size,
+            device="cpu",
+            garments=garments,
+            rmse_mm=error,
+            **{"ms_network": 0.5, "cold_s": 1.0, "params": 9, "flops": nan} | more,
+            weights_mb=0.1,
+            peak_mb=nan,
+        )
+
+    rows = [row("network", "small", 3, 9.0)]
+    rows += [row("engine", "blender", k, nan, ms_per_frame=600.0 * k) for k in (1, 2, 3)]
+    assert engines(rows) == {"3 garments": {"blender (another cloth)": 1800.0}}
+    assert [p[1] for p in points(rows)] == ["network, live"]
+    # Whichever was measured first, the table has one order.
+    rows += [row("network", "local", 1, 9.0, params=99), row("lbs", "-", 1, 20.0)]
+    placed = [r.size for r in sorted(rows, key=_place)]
+    assert placed == ["-", "blender", "blender", "blender", "small", "local"]
+
+
+def test_a_row_timed_again_has_the_errors_of_its_garments():
+    nan = float("nan")
+
+    def row(method, garments, error, each):
+        common = ("cpu", 1, garments, error, 1.0, 0.5, 1.0, 9, nan, 0.1, nan)
+        return Cost(method, "small", *common, rmse_each=each)
+
+    each = {"top": 2.0, "bottom": 3.0, "dress": 7.0}
+    known = [row("network", 3, 4.0, each), row("network+push", 3, 9.0, {})]
+    two = _with_errors(row("network", 2, nan, {}), known)
+    assert two.rmse_mm == 2.5 and two.rmse_each == {"top": 2.0, "bottom": 3.0}
+    assert _with_errors(row("network", 3, nan, {}), known).rmse_mm == 4.0
+    # Nothing is made up where a garment's error isn't known.
+    assert np.isnan(_with_errors(row("network+push", 2, nan, {}), known).rmse_mm)
+    assert _with_errors(row("network+push", 3, nan, {}), known).rmse_mm == 9.0

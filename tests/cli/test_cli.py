@@ -10,6 +10,7 @@ import pytest
 from physxnet_jax._environment import check_jaxlib, jaxlib_problem
 from physxnet_jax.cli import main
 from physxnet_jax.cli._main import _COMMANDS, parse
+from physxnet_jax.dressing import load_ladder
 from physxnet_jax.errors import BrokenInstallError, MotionError, PhysXNetError
 from physxnet_jax.garment import template
 from physxnet_jax.io import load_garment, read_obj, write_obj
@@ -23,7 +24,7 @@ def test_doctor_and_clips_print_what_there_is(capsys):
     assert "side step" in capsys.readouterr().out
 
 
-def test_every_command_that_prints_tables_prints_json(tmp_path, capsys):
+def test_every_command_that_prints_tables_prints_json(tmp_path, capsys, monkeypatch):
     """One text each, whose numbers are those of the table."""
 
     def told(*words):
@@ -47,6 +48,13 @@ def test_every_command_that_prints_tables_prints_json(tmp_path, capsys):
     code, found = told("fit", str(tmp_path / "b.obj"), "-o", str(tmp_path / "c.obj"))
     assert code == 0 and found["files"] == [str(tmp_path / "c.obj")]
     assert found["result"]["template"] == "bottom"
+    code, found = told("rest", "--wear", "top", "-o", str(tmp_path / "rest"))
+    assert code == 0 and [pathlib.Path(f).name for f in found["files"]] == ["body.obj", "top.obj"]
+    times = {r.name: dict.fromkeys(r.rmse_mm, 1.5) for r in load_ladder()}
+    monkeypatch.setattr("physxnet_jax.cli._calibrate.measure", lambda *_, **__: times)
+    code, found = told("calibrate")
+    assert {r["method"] for r in found["rungs"]} == set(times)
+    assert all(r["ms_per_frame"].keys() == r["rmse_mm"].keys() for r in found["rungs"])
 
 
 def test_a_jaxlib_that_miscomputes_is_refused(monkeypatch, capsys):

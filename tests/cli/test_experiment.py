@@ -34,11 +34,11 @@ def test_build_train_evaluate(data_dir, tmp_path, capsys):
     build = ["dataset", "build", str(tmp_path / "dataset.py"), "--out", root, "--mocap", mocap]
     assert main([*build, "--only", "run", "--quiet"]) == 0
     assert len(list_sequences(root)) == 1 and len(read_log(root)) == 1
-    found = str(tmp_path / "found.json")
     sheet = tmp_path / "sheet.png"
-    check = ["dataset", "check", root, "--mocap", mocap, "--json", found, "--sheet", str(sheet)]
+    check = ["dataset", "check", root, "--mocap", mocap, "--json", "--sheet", str(sheet)]
+    capsys.readouterr()
     assert main(check) in (0, 1)
-    rows = json.loads((tmp_path / "found.json").read_text())["rows"]
+    rows = json.loads(capsys.readouterr().out)["rows"]
     assert {r["quantity"] for r in rows} >= {"frames missing", "largest offset, m"}
     assert sheet.stat().st_size > 1000
     train = ["train", str(tmp_path / "tiny.py"), "--data", root, "--out", run, "--steps", "2"]
@@ -51,8 +51,9 @@ def test_build_train_evaluate(data_dir, tmp_path, capsys):
     # Errors on what was learned from: only that the way is whole is asked here.
     measure = ["evaluate", "lbs", run, f"{run}+push", "--data", root, "--split", "train"]
     measure += ["--templates", "bottom", "--out", out]
-    assert main(measure) == 0
+    assert main([*measure, "--json"]) == 0
     rows = json.loads((tmp_path / "errors.json").read_text())
+    assert json.loads(capsys.readouterr().out) == rows
     assert [r["method"] for r in rows] == ["lbs", "run", "run+push"]
     assert all(r["finite_share"] == 1.0 and 0 < r["rmse_vertices_mm"] < 200 for r in rows)
     assert (tmp_path / "errors_vertices.png").is_file()

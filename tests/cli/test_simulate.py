@@ -198,18 +198,27 @@ def test_the_price_list_tells_effects_that_matter_from_those_that_do_not(tmp_pat
     assert not advice["SelfContact"].needed and "never comes nearer" in advice["SelfContact"].why
 
 
-def test_effects_prints_its_table(tmp_path, capsys):
+def test_effects_prints_its_table(tmp_path, capsys, monkeypatch):
     path, rows = tmp_path / "scene.toml", tmp_path / "rows.json"
     path.write_text(
         'motion = "balance"\nframes = 2\naccuracy = "draft"\ngarments = ["bottom"]\n'
         "[effects.gravity]\n[effects.body_contact]\n"
     )
-    assert main(["effects", str(path), "--json", str(rows)]) == 0
+    measured = []
+
+    def price(*words, **more):
+        measured[:] = measured or price_effects(*words, **more)
+        return measured
+
+    monkeypatch.setattr("physxnet_jax.cli._simulate.price_effects", price)
+    assert main(["effects", str(path), "-o", str(rows)]) == 0
     said = capsys.readouterr().out
     assert "BodyContact" in said and "inside" in said
     data = json.loads(rows.read_text())["effects"]
     assert [r["without"] for r in data] == ["", "Gravity", "BodyContact"]
     assert data[2]["mflop"] < data[0]["mflop"] and data[1]["rms_mm"] > 100
+    assert main(["effects", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["effects"] == data
 
 
 def test_without_blender_the_way_to_it_is_told(monkeypatch):

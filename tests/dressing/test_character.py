@@ -3,6 +3,7 @@
 import dataclasses
 
 import fast_simplification
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from physxnet_jax.dressing._character import (
     on_character,
 )
 from physxnet_jax.dressing._dress import unbound_wearable
+from physxnet_jax.dressing._layers import layer_height
 from physxnet_jax.dressing._push_out import make_patch
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import template
@@ -75,6 +77,29 @@ def test_a_stranger_wears_what_he_would_wear(man, character):
         # The control: on another person's shape they are elsewhere.
         assert rmse(wrong.positions, b.positions) > 0.04
     assert worn.inside["bottom"] < 0.01 and worn.inside["top"] < 0.04
+
+
+def test_what_is_moved_off_his_skin_stays_beneath_what_is_over_it(character, monkeypatch):
+    known = []
+
+    def keep(layers, wearables, positions):
+        known[:] = layers
+        return positions
+
+    monkeypatch.setattr("physxnet_jax.dressing._dress.lift_clip", keep)
+    crossing = dress(character, ["dress", "top"], method="lbs", frames=2)
+    monkeypatch.undo()
+    apart = dress(character, ["dress", "top"], method="lbs", frames=2)
+    (layer,) = known
+
+    def beneath(clip):
+        worn = [jnp.asarray(g.positions) for g in clip.garments]
+        height = jax.vmap(lambda a, b: layer_height(layer, a, b)[0])
+        return float((height(worn[layer.inner], worn[layer.outer]) < 0.0).mean())
+
+    assert beneath(apart) < 0.5 * beneath(crossing) and beneath(apart) < 0.02
+    np.testing.assert_array_equal(crossing.garments[0].positions, apart.garments[0].positions)
+    assert apart.inside["top"] < 0.04
 
 
 def test_network_and_simulation_dress_him_too(man, character):

@@ -1,12 +1,15 @@
 """Methods by name: what the words behind a network's name do."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from physxnet_jax.body import load_body
 from physxnet_jax.data import mirrored_offsets
 from physxnet_jax.dressing import Rung, method_by_name
-from physxnet_jax.errors import WeightsError
+from physxnet_jax.errors import MissingDependencyError, WeightsError
+from physxnet_jax.evaluation import ENGINES
 from physxnet_jax.io import load_predictor, read_card, weights_size
 from physxnet_jax.motion import Motion, load_motion, mirrored
 
@@ -23,6 +26,30 @@ def test_a_name_with_mirror_answers_the_mirrored_person_with_the_mirrored_cloth(
         away[name] = np.linalg.norm(one - mirrored_offsets("top", two), axis=-1).mean()
     # What is left is sampling: the meshes of both halves aren't the same.
     assert away["nano+mirror"] < 0.3e-3 < 2e-3 < away["nano"]
+
+
+def test_an_engine_is_asked_as_any_other_way(monkeypatch):
+    """A stand-in: the template skinned, the first frame slow to come."""
+    asked = []
+
+    def stand_in(scene, motion):
+        (garment,) = scene.garments
+        asked.append((garment.name, motion.num_frames))
+        cloth = method_by_name("lbs")(motion, garment.name).positions
+        return SimpleNamespace(
+            positions=(cloth,), diagnostics={"milliseconds": np.array([900.0, 5.0, 7.0])}
+        )
+
+    monkeypatch.setitem(ENGINES, "blender", stand_in)
+    walk = load_motion("walk", fps=30.0)
+    walk = Motion(walk.rotations[:3], walk.root[:3], walk.fps, walk.name)
+    answer = method_by_name("blender")(walk, "bottom")
+    assert asked == [("bottom", 3)] and answer.ms_per_frame == 6.0
+    np.testing.assert_array_equal(answer.positions, method_by_name("lbs")(walk, "bottom").positions)
+    monkeypatch.undo()
+    monkeypatch.setenv("PHYSXNET_BLENDER", "/nowhere/blender")
+    with pytest.raises(MissingDependencyError, match="PHYSXNET_BLENDER"):
+        method_by_name("blender")(walk, "bottom")
 
 
 def test_the_card_is_that_of_the_weights():

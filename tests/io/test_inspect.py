@@ -6,11 +6,13 @@ import pathlib
 import numpy as np
 import pytest
 
+from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
 from physxnet_jax.dressing import dress
 from physxnet_jax.errors import FormatError, MeshError
 from physxnet_jax.garment import template
 from physxnet_jax.io import fit_garment, inspect_garment, load_garment, read_obj, write_obj
+from physxnet_jax.io._inspect import _like
 
 
 @pytest.fixture(scope="module")
@@ -95,6 +97,15 @@ def test_what_is_worn_after_fitting_is_what_the_template_wears(tmp_path, trouser
     np.testing.assert_allclose(worn.garments[0].positions, same.garments[0].positions, atol=2e-4)
 
 
+def test_how_far_it_is_from_each_template_is_told(tmp_path, trousers, capsys):
+    path = saved(tmp_path, "a.obj", *trousers)
+    found = inspect_garment(path)
+    assert found.apart["bottom"] < 1e-4 and found.apart["dress"] > 0.02
+    assert found.apart["top"] > 0.1 and min(found.apart, key=found.apart.__getitem__) == "bottom"
+    main(["inspect", str(path)])
+    assert "bottom 0 mm" in capsys.readouterr().out
+
+
 def test_cloth_in_the_body_is_moved_out(tmp_path, trousers):
     v, faces = trousers
     thin = v * [0.9, 1.0, 0.9]
@@ -176,3 +187,23 @@ def test_a_real_dress_is_ready_once_it_is_fitted(data_dir, tmp_path):
     )
     assert any("lifted" in line for line in done)
     assert found.problems == () and found.template == "dress" and found.inside == 0.0
+
+
+@pytest.mark.parametrize("name", ["top", "bottom", "dress"])
+def test_however_it_lies_and_faces_it_is_put_where_the_template_is(name):
+    """Of a mesh that is the template, turned: to where the template's vertices are."""
+    garment, skin = template(name), load_body().rest_mesh()
+    there = np.asarray(garment.mesh.vertices, np.float64)
+    x, y, z = there.T
+    lying = {
+        "Y up": (x, y, z),
+        "Y up, turned by 90": (-z, y, x),
+        "Y up, turned by 180": (-x, y, -z),
+        "Z up": (x, -z, y),
+        "Z up, turned by 180": (-x, z, y),
+        "X up": (y, -x, z),
+    }
+    for how, axes in lying.items():
+        placed, told, off = _like(100.0 * np.stack(axes, axis=1) + 40.0, garment, skin)
+        assert np.abs(placed - there).max() < 1e-6, f"{how}: {told}"
+        assert how[:4] in told and ("turned" in told) == ("turned" in how) and off < 0.2

@@ -196,6 +196,29 @@ def test_the_command_serves_until_it_is_ended_and_writes_pages(tmp_path, capsys,
     assert len(opened) == 1 and "ssh -L 8300:localhost:8300" in console.file.getvalue()
 
 
+def test_the_command_chooses_all_that_the_page_does(tmp_path, monkeypatch):
+    chosen = []
+    monkeypatch.setattr("physxnet_jax.cli._view.Viewer", lambda c, **_: chosen.append(c) or 1 / 0)
+    words = ["view", "punch", "--shape", "weight_up=0.5", "--wind", "0", "1", "4"]
+    words += ["--fabric", "silk", "--accuracy", "draft", "--self-contact", "--no-push-out"]
+    with pytest.raises(ZeroDivisionError):
+        view(parse(words), Console(file=io.StringIO()))
+    assert chosen == [
+        Choice(
+            motion="punch",
+            shape=(("weight_up", 0.5),),
+            wind=(0.0, 1.0, 4.0),
+            fabric="silk",
+            accuracy="draft",
+            self_contact=True,
+            push_out=False,
+        )
+    ]
+    assert main(["view", "--shape", "weight_up"]) == 2
+    assert main(["view", "--shape", "girth=1", "--html", str(tmp_path / "a.html")]) == 2
+    assert main(["view", "--fabric", "tin", "--html", str(tmp_path / "a.html")]) == 2
+
+
 @pytest.fixture
 def page(viewer, tmp_path):
     it = _BROWSER["Page"](viewer.url, tmp_path / "profile")

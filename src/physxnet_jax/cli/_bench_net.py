@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 import pathlib
+import statistics
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ from ..dressing import (
     weights_folder,
 )
 from ..errors import FormatError
+from ..evaluation import ENGINES
 from ..files import whole_file
 from ..garment import TEMPLATES
 from ..io import load_predictor
@@ -46,7 +48,7 @@ def bench_net(command: Bench, console: Console) -> int:
         rows = [_from_json(r) for r in json.loads(command.out.read_text())["rows"]]
     plain: Precision = "float32"
     jobs: list[tuple[str, str, Precision]] = [("lbs", "-", plain)]
-    jobs.extend(("simulator", s, plain) for s in command.simulator)
+    jobs.extend(("engine" if s in ENGINES else "simulator", s, plain) for s in command.simulator)
     jobs.extend(("network", w, p) for w in command.weights for p in command.precisions)
     with progress_bars(console) as progress:
         for k, (kind, size, precision) in enumerate(jobs):
@@ -60,14 +62,12 @@ def bench_net(command: Bench, console: Console) -> int:
             ]
             if command.times:
                 # Errors don't change; a method without any isn't measured anew.
-                errors = {(r.method, r.garments): (r.rmse_mm, r.rmse_each) for r in known}
                 again = _measure(kind, size, precision, command, []) if known else ()
                 rows = [r for r in rows if r not in known]
-                for r in again:
-                    mean, each = errors.get((r.method, r.garments), (math.nan, {}))
-                    rows.append(dataclasses.replace(r, rmse_mm=mean, rmse_each=each))
+                rows += [_with_errors(r, known) for r in again]
             elif not known:
                 rows += list(_measure(kind, size, precision, command, tests))
+            rows.sort(key=_place)
             if command.out is not None:
                 data = [_to_json(r) for r in rows]
                 with whole_file(command.out) as part:
@@ -80,9 +80,29 @@ def bench_net(command: Bench, console: Console) -> int:
     if command.out is not None:
         with whole_file(command.out.with_suffix(".md")) as part:
             part.write_text(text)
-        draw_work_precision(command.out.with_suffix(".png"), points(rows), floors(rows))
+        draw_work_precision(
+            command.out.with_suffix(".png"), points(rows), floors(rows), engines(rows)
+        )
         console.print(f"wrote {command.out}, .md and .png", highlight=False)
     return 0
+
+
+def _with_errors(row: Cost, known: Sequence[Cost]) -> Cost:
+    """A row that was timed again, with the errors it had: a garment's doesn't change."""
+    same = [r for r in known if r.method == row.method]
+    each = {t: e for r in same for t, e in r.rmse_each.items()}
+    mine = {t: each[t] for t in TEMPLATES[: row.garments] if t in each}
+    mean = statistics.fmean(mine.values()) if len(mine) == row.garments else math.nan
+    # Not all that was measured says what each garment's is.
+    mean = next((r.rmse_mm for r in same if r.garments == row.garments), mean)
+    return dataclasses.replace(row, rmse_mm=mean, rmse_each=mine)
+
+
+def _place(row: Cost) -> tuple[object, ...]:
+    """Where a row stands in the table, whichever was measured first."""
+    kind = row.method.partition("+")[0]
+    place = ("lbs", "simulator", "engine", "network").index(kind)
+    return place, row.params, row.size, row.precision, row.method, row.garments, row.batch
 
 
 def _measure(
@@ -91,7 +111,8 @@ def _measure(
     walk = load_motion("walk", fps=30.0)
     if kind != "network":
         method = method_by_name("lbs" if kind == "lbs" else size)
-        yield from other_costs(kind, size, method, walk, mean_errors(method, tests, TEMPLATES))
+        errors = {} if kind == "engine" else mean_errors(method, tests, TEMPLATES)
+        yield from other_costs(kind, size, method, walk, errors)
         return
     source = weights_folder(size)
     predictor = at_precision(load_predictor(source), precision)
@@ -127,6 +148,16 @@ def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
 def floors(rows: Sequence[Cost]) -> dict[str, float]:
     """What two runs of the simulator that should be one differ by, for each panel."""
     return {_panel(r): r.rmse_mm for r in rows if _is_noise(r) and not math.isnan(r.rmse_mm)}
+
+
+def engines(rows: Sequence[Cost]) -> dict[str, dict[str, float]]:
+    """What cloth engines take [ms a frame], for each panel."""
+    panels = {p[0] for p in points(rows)}
+    out: dict[str, dict[str, float]] = {}
+    for r in rows:
+        if r.method == "engine" and _panel(r) in panels:
+            out.setdefault(_panel(r), {})[f"{r.size} (another cloth)"] = r.ms_per_frame
+    return out
 
 
 def _panel(row: Cost) -> str:

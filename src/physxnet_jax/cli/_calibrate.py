@@ -16,7 +16,7 @@ from ..errors import PhysXNetError
 from ..garment import TEMPLATES
 from ..io import load_garment
 from ._commands import Calibrate, Dress
-from ._progress import progress_bars
+from ._progress import print_json, progress_bars
 
 
 def calibrate(command: Calibrate, console: Console) -> int:
@@ -26,6 +26,12 @@ def calibrate(command: Calibrate, console: Console) -> int:
     ladder = load_ladder()
     with progress_bars(console) as progress:
         times = measure(ladder, report=lambda _, k, n: progress("timing", k, n))
+    if command.json:
+        rungs = [
+            {"method": r.name, "ms_per_frame": times[r.name], "rmse_mm": r.rmse_mm} for r in ladder
+        ]
+        print_json({"rungs": rungs, "files": [calibration_file()]})
+        return 0
     table = Table(title="ms a frame on this machine | mm from the simulation")
     table.add_column("method")
     for name in TEMPLATES:

@@ -97,7 +97,7 @@ class Fit:
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
     """The OBJ to write: metres, Y up, on the body at rest."""
     like: Literal["top", "bottom", "dress"] | None = None
-    """Scale and move it to where this template is, instead of guessing its unit."""
+    """Turn, scale and move it to where this template is, instead of guessing its unit."""
     edge_length: float | None = None
     """Split edges that are longer than this [mm]."""
     decimate: float | None = None
@@ -128,6 +128,8 @@ class Rest:
     """Templates to write beside it, as a body of that shape wears them."""
     shape: tuple[str, ...] = ()
     """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -146,6 +148,8 @@ class Demo:
     """Folder to write to."""
     frames: int | None = None
     """Stop after this many frames."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -179,6 +183,8 @@ class Calibrate:
 
     again: bool = False
     """Forget what was measured before."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -257,7 +263,7 @@ class Effects:
 
     Examples:
       physxnet effects walk --wear top --frames 20
-      physxnet effects scene.toml --recommend --json effects.json
+      physxnet effects scene.toml --recommend -o effects.json
     """
 
     scene: tyro.conf.Positional[str]
@@ -276,8 +282,10 @@ class Effects:
     """Say which effects matter, those that the scene doesn't have included."""
     tolerance: float = 2.0
     """Differences below this don't matter [mm]."""
-    json: pathlib.Path | None = None
-    """Write the rows to this file."""
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Write the rows to this file, as JSON."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -295,6 +303,7 @@ class View:
       physxnet view
       physxnet view dance.bvh --wear my_shirt.obj bottom
       physxnet view walk --wear dress --html walk.html
+      physxnet view punch --wear top --method simulate --wind 0 0 4 --fabric silk
     """
 
     motion: tyro.conf.Positional[str] = "walk"
@@ -307,6 +316,18 @@ class View:
     """Name of network weights."""
     compare: bool = False
     """Simulate the same clothes beside it and colour by the distance."""
+    push_out: bool = True
+    """Push vertices that end inside the body onto it."""
+    shape: tuple[str, ...] = ()
+    """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
+    accuracy: Literal["draft", "standard", "fine"] = "standard"
+    """What a simulation may cost."""
+    fabric: str | None = None
+    """cotton, denim, silk, wool, jersey or leather for all garments when simulated."""
+    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Steady wind when simulated [m/s]."""
+    self_contact: bool = False
+    """Garments collide with themselves when simulated."""
     frames: int = 150
     """Frames at most."""
     fps: float = 30.0
@@ -351,6 +372,8 @@ class Export:
     """Push vertices that end inside the body onto it."""
     platforms: tuple[str, ...] = ("cpu", "cuda")
     """Where it will run."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False

@@ -1,7 +1,6 @@
 """`physxnet dataset`: build one, or look it over."""
 
 import dataclasses
-import json
 import pathlib
 import time
 from collections.abc import Callable
@@ -29,7 +28,7 @@ from ..motion import Motion
 from ..viewer import render_frame
 from ._configs import mocap_folder, read_config
 from ._experiment_commands import Dataset
-from ._progress import progress_bars
+from ._progress import print_json, progress_bars
 
 _TILE = (220, 260)
 
@@ -109,10 +108,10 @@ def _check(command: Dataset, console: Console) -> int:
         table.add_row(f.case, f.quantity, f"{f.bound:g}", f"{f.measured:.3g}")
     console.print(table)
     console.print(f"{len(folders)} actions, {size / 1e6:.1f} MB, sha256 {digest}", highlight=False)
-    if command.json is not None:
-        rows = {"sha256": digest, "bytes": size, "rows": [dataclasses.asdict(f) for f in found]}
-        with whole_file(command.json) as part:
-            part.write_text(json.dumps(rows, indent=1) + "\n")
+    if command.json:
+        print_json(
+            {"sha256": digest, "bytes": size, "rows": [dataclasses.asdict(f) for f in found]}
+        )
     if command.sheet is not None:
         import imageio.v3 as iio
 

@@ -13,6 +13,7 @@ from ..data import Sequence, list_sequences, read_sequence
 from ..dressing import method_by_name, weights_folder
 from ..errors import FormatError, PhysXNetError
 from ..evaluation import (
+    ENGINES,
     ActionError,
     Method,
     error_tables,
@@ -30,7 +31,7 @@ from ..simulation import ACCURACY
 from ..training import usable_garment
 from ..viewer import draw_bars
 from ._experiment_commands import Evaluate
-from ._progress import progress_bars
+from ._progress import print_json, progress_bars
 
 
 def evaluate(command: Evaluate, console: Console) -> int:
@@ -84,6 +85,8 @@ def evaluate(command: Evaluate, console: Console) -> int:
                 f"RMSE over {what} [mm]",
             )
         console.print(f"wrote {command.out}, .md and two charts", highlight=False)
+    if command.json:
+        print_json([_rounded(r) for r in rows])
     return 0
 
 
@@ -134,7 +137,7 @@ def _method(name: str, command: Evaluate, progress: Callable[[str, int, int], No
             [read_sequence(f) for f in list_sequences(root, "train")], command.templates
         )
         return nearest_frame(known) if name == "nearest" else pose_network(known, report=progress)
-    if name not in ("lbs", "noise", *ACCURACY):
+    if name not in ("lbs", "noise", *ACCURACY, *ENGINES):
         # Before minutes are spent on other methods.
         predictor = load_predictor(weights_folder(name.removesuffix("+push")))
         missing = set(command.templates) - set(predictor.config.templates)

@@ -13,7 +13,7 @@ class Stress:
 
     Examples:
       physxnet stress
-      physxnet stress --cases free_fall scrambled_start --json stress.json
+      physxnet stress --cases free_fall scrambled_start -o stress.json
       physxnet stress --peers blender newton
     """
 
@@ -21,8 +21,10 @@ class Stress:
     """Names of cases; all of them if none is given."""
     peers: tuple[Literal["blender", "newton"], ...] = ()
     """Other simulators that run the cases they can (PHYSXNET_BLENDER, PHYSXNET_NEWTON)."""
-    json: pathlib.Path | None = None
-    """Write the rows to this file."""
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Write the rows to this file, as JSON."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -47,8 +49,9 @@ class Bench:
     """net: names or folders of weights, or runs."""
     data: pathlib.Path | None = None
     """net: a dataset whose test actions give the errors; times alone without one."""
-    simulator: tuple[Literal["draft", "standard", "fine", "noise"], ...] = ()
-    """net: accuracies of the simulator to run as well; noise is standard with jitter."""
+    simulator: tuple[Literal["draft", "standard", "fine", "noise", "blender", "newton"], ...] = ()
+    """net: accuracies of the simulator to run as well; noise is standard with jitter.
+    blender, newton: their times alone, for they model another cloth."""
     precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32",)
     """net: what the networks' arithmetic is done in."""
     backward: bool = False
@@ -106,8 +109,8 @@ class Dataset:
     """build: names of actions."""
     sheet: pathlib.Path | None = None
     """check: a contact sheet, .png."""
-    json: pathlib.Path | None = None
-    """check: findings as JSON."""
+    json: bool = False
+    """check: print all findings as JSON instead of those out of bounds as a table."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False
@@ -170,6 +173,8 @@ class Evaluate:
     Rows that are there already are kept."""
     times: bool = False
     """Measure the times of these methods' rows again, in one go, and nothing else."""
+    json: bool = False
+    """Print JSON for machines instead of tables."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False

@@ -4,6 +4,7 @@ from rich.console import Console
 
 from ..dressing import export_dresser, make_dresser
 from ._commands import Export
+from ._progress import print_json
 
 
 def export(command: Export, console: Console) -> int:
@@ -17,6 +18,9 @@ def export(command: Export, console: Console) -> int:
             platforms=command.platforms,
             name=command.weights,
         )
+    if command.json:
+        print_json({"files": files})
+        return 0
     for file in files:
         console.print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)", highlight=False)
     console.print(

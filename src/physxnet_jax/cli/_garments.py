@@ -53,7 +53,7 @@ def fit(command: Fit, console: Console) -> int:
 
 def rest(command: Rest, shape: Float[Array, " shapes"], console: Console) -> int:
     """Writes the body of that shape, and templates as it wears them, at rest."""
-    body = load_body()
+    body, files = load_body(), []
     meshes = {"body": body.rest_mesh(shape)}
     for name in command.wear:
         garment = template(name)
@@ -64,7 +64,11 @@ def rest(command: Rest, shape: Float[Array, " shapes"], console: Console) -> int
         path = command.out / f"{name}.obj"
         chart = (None if x is None else np.asarray(x) for x in (mesh.uv, mesh.uv_faces))
         write_obj(path, np.asarray(mesh.vertices), np.asarray(mesh.faces), *chart)
-        console.print(f"wrote {path}", highlight=False)
+        files.append(path)
+        if not command.json:
+            console.print(f"wrote {path}", highlight=False)
+    if command.json:
+        print_json({"files": files})
     return 0
 
 
@@ -88,6 +92,7 @@ def _show(found: Inspection, console: Console) -> None:
             ("inside the body", f"{100 * found.inside:.1f} %"),
             ("facing outwards", f"{100 * found.outward:.0f} %"),
             ("dressed by", found.template or "-"),
+            ("apart from", ", ".join(f"{t} {1e3 * d:.0f} mm" for t, d in found.apart.items())),
             ("rays that bind it", f"{100 * found.hit_rate:.1f} %"),
         ]
     for name, value in rows:

@@ -27,6 +27,7 @@ from ._commands import (
 from ._doctor import doctor
 from ._experiment_commands import Bench, Dataset, Evaluate, Stress, Train
 from ._progress import print_json, progress_bars
+from ._shape import parse_shape
 
 _COMMANDS: dict[str, type] = {
     "dress": Dress,
@@ -121,49 +122,51 @@ def _run(
     | View,
     console: Console,
 ) -> int:
+    told = getattr(command, "json", False) is True
+    silent = told or getattr(command, "quiet", False)
+    heard = Console(quiet=True) if silent else console
     if isinstance(command, Dataset | Train | Evaluate):
-        return _experiment(command, Console(quiet=True) if command.quiet else console)
+        return _experiment(command, heard)
     if isinstance(command, Calibrate):
         from ._calibrate import calibrate
 
-        return calibrate(command, Console(quiet=True) if command.quiet else console)
+        return calibrate(command, heard)
     if isinstance(command, Export):
         from ._export import export
 
-        return export(command, Console(quiet=True) if command.quiet else console)
+        return export(command, heard)
     if isinstance(command, Inspect | Fit):
         from ._garments import fit, inspect
 
         if isinstance(command, Inspect):
             return inspect(command, console)
-        return fit(command, Console(quiet=True) if command.quiet else console)
+        return fit(command, heard)
     if isinstance(command, Rest):
         from ..body import load_body
         from ._garments import rest
 
-        shape = load_body().shape(**_parse_shape(command.shape))
-        return rest(command, shape, Console(quiet=True) if command.quiet else console)
+        shape = load_body().shape(**parse_shape(command.shape))
+        return rest(command, shape, heard)
     if isinstance(command, View):
         from ._view import view
 
-        return view(command, Console(quiet=True) if command.quiet else console)
+        return view(command, heard)
     if isinstance(command, Bench):
         from ._bench import bench
         from ._bench_net import bench_net
 
         run = bench if command.what == "sim" else bench_net
-        return run(command, Console(quiet=True) if command.quiet else console)
+        return run(command, heard)
     if isinstance(command, Simulate | Effects):
         from ._simulate import price, simulate
 
-        quiet = Console(quiet=True) if command.quiet else console
         if isinstance(command, Simulate):
-            return simulate(command, quiet)
-        return price(command, quiet)
+            return simulate(command, heard)
+        return price(command, heard)
     if isinstance(command, Stress):
         from ._stress import stress
 
-        return stress(command, Console(quiet=True) if command.quiet else console)
+        return stress(command, heard)
     if isinstance(command, Doctor):
         return doctor(console, json=command.json)
     if isinstance(command, Clips):
@@ -181,7 +184,7 @@ def _run(
         return 0
     if isinstance(command, Demo):
         out = command.out
-        common = {"frames": command.frames, "quiet": command.quiet}
+        common = {"frames": command.frames, "quiet": command.quiet, "json": command.json}
         jobs = Dress("walk", out=out / "demo.usdc", preview=out / "demo.mp4", **common)
         return _dress(jobs, console, still=out / "demo.png")
     return _dress(command, console)
@@ -215,7 +218,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
         check_output(command.out)
     if command.preview is not None:
         check_preview(command.preview)
-    shape = load_body().shape(**_parse_shape(command.shape)) if command.shape else None
+    shape = load_body().shape(**parse_shape(command.shape)) if command.shape else None
     if command.own_body and (command.shape or command.joint_map or command.skeleton):
         raise PhysXNetError(
             "--own-body brings its shape along and needs no joints: leave out --shape,"
@@ -286,19 +289,6 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     for path in written:
         console.print(f"wrote {path} (import at {clip.fps:g} fps)", highlight=False)
     return 0
-
-
-def _parse_shape(words: Sequence[str]) -> dict[str, float]:
-    out = {}
-    for word in words:
-        name, _, value = word.partition("=")
-        try:
-            out[name] = float(value)
-        except ValueError:
-            raise PhysXNetError(
-                f"--shape {word}: expected name=number, for example weight_up=0.5."
-            ) from None
-    return out
 
 
 if __name__ == "__main__":

@@ -215,11 +215,13 @@ def price(command: Effects, console: Console) -> int:
     console.print(table)
     for a in advice:
         console.print(f"{a.effect}: {'needed' if a.needed else 'not needed'}. {a.why}")
-    if command.json is not None:
-        data = {
-            "effects": [dataclasses.asdict(r) for r in rows],
-            "recommendation": [dataclasses.asdict(a) for a in advice],
-        }
-        with whole_file(command.json) as part:
+    data = {
+        "effects": [dataclasses.asdict(r) for r in rows],
+        "recommendation": [dataclasses.asdict(a) for a in advice],
+    }
+    if command.out is not None:
+        with whole_file(command.out) as part:
             part.write_text(json.dumps(data, indent=1) + "\n")
+    if command.json:
+        print_json(data)
     return 0

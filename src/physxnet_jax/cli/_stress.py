@@ -9,13 +9,10 @@ from rich.progress import Progress
 from rich.table import Table
 
 from ..errors import PhysXNetError
-from ..evaluation import CASES, PEER_CASES, Finding, run_case, run_peer
+from ..evaluation import CASES, ENGINES, PEER_CASES, Finding, run_case, run_peer
 from ..files import whole_file
-from ..simulation.blender import simulate_blender
-from ..simulation.newton import simulate_newton
 from ._experiment_commands import Stress
-
-_ENGINES = {"blender": simulate_blender, "newton": simulate_newton}
+from ._progress import print_json
 
 
 def stress(command: Stress, console: Console) -> int:
@@ -32,7 +29,7 @@ def stress(command: Stress, console: Console) -> int:
             rows += run_case(name)
             if name in PEER_CASES:
                 for peer in command.peers:
-                    others[peer, name] = run_peer(name, _ENGINES[peer])
+                    others[peer, name] = run_peer(name, ENGINES[peer])
             # Every case compiles its own programs; kept, they would fill the memory.
             jax.clear_caches()
             bar.advance(task)
@@ -63,8 +60,10 @@ def stress(command: Stress, console: Console) -> int:
         tried = [(r, beside(r)[p]) for r in rows if p in beside(r)]
         held = sum(value <= r.bound for r, value in tried)
         console.print(f"{p}: {held} of {len(tried)} bounds hold", highlight=False)
-    if command.json is not None:
-        data = [{**dataclasses.asdict(r), "holds": r.holds, **beside(r)} for r in rows]
-        with whole_file(command.json) as part:
+    data = [{**dataclasses.asdict(r), "holds": r.holds, **beside(r)} for r in rows]
+    if command.out is not None:
+        with whole_file(command.out) as part:
             part.write_text(json.dumps(data, indent=1) + "\n")
+    if command.json:
+        print_json(data)
     return 0 if all(r.holds for r in rows) else 1

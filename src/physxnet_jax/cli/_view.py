@@ -9,6 +9,7 @@ from rich.console import Console
 from ..viewer import Choice, Viewer, record
 from ._commands import View
 from ._progress import progress_bars
+from ._shape import parse_shape
 
 
 def view(command: View, console: Console, *, over: threading.Event | None = None) -> int:
@@ -25,6 +26,12 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         method=command.method,
         weights=command.weights,
         compare=command.compare,
+        push_out=command.push_out,
+        shape=tuple(parse_shape(command.shape).items()),
+        accuracy=command.accuracy,
+        fabric=command.fabric,
+        wind=command.wind,
+        self_contact=command.self_contact,
         frames=command.frames,
         fps=command.fps,
         source_fps=command.source_fps,

@@ -99,6 +99,26 @@ def predict_clip(
     return positions, inside
 
 
+def lift_clip(
+    layers: Sequence[Layer], wearables: Sequence[Wearable], positions: dict[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    """Garments of a clip [m], each off those beneath it once more."""
+    if not layers:
+        return positions
+    names = [w.name for w in wearables]
+    frames = len(positions[names[0]])
+    blocks = []
+    for at in range(0, frames, BLOCK):
+        worn = tuple(jnp.asarray(padded_block(positions[n], at, 0)) for n in names)
+        blocks.append([np.asarray(x) for x in _lift_block(tuple(layers), worn)])
+    return {n: np.concatenate([b[k] for b in blocks])[:frames] for k, n in enumerate(names)}
+
+
+@jax.jit
+def _lift_block(layers: tuple[Layer, ...], worn: tuple[Array, ...]) -> tuple[Array, ...]:
+    return tuple(lift_layers(layers, worn))
+
+
 def simulate_clip(
     garments: Sequence[Garment],
     clip: Motion,

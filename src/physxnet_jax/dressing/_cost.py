@@ -15,7 +15,7 @@ import numpy as np
 
 from ..data import Sequence
 from ..evaluation import Method, network, skinning, vertex_error
-from ..garment import Template
+from ..garment import TEMPLATES, Template
 from ..io import weights_size
 from ..models import Predictor
 from ..motion import BLOCK, Motion
@@ -32,8 +32,8 @@ class Cost:
     """One way to dress: what it costs and how far it is off.
 
     Attributes:
-        method: ``lbs``, ``network``, ``network+push`` or ``simulator``.
-        size: Name of the weights or the simulator's accuracy.
+        method: ``lbs``, ``network``, ``network+push``, ``simulator`` or ``engine``.
+        size: Name of the weights, the simulator's accuracy or the engine.
         device: What it ran on.
         batch: Frames a call; 1 is live, a frame in and a frame out.
         garments: Garments worn, in the order top, bottom, dress.
@@ -99,12 +99,11 @@ def network_costs(
     """
     size = pathlib.Path(weights).name
     params = sum(x.size for x in jax.tree.leaves(predictor.state))
-    worn: tuple[Template, ...] = ("top", "bottom", "dress")
     for resolve in (False, True):
         method = "network+push" if resolve else "network"
         for number in garments:
             dresser = make_dresser(
-                worn[:number], weights=predictor, resolve=resolve, precision=precision
+                TEMPLATES[:number], weights=predictor, resolve=resolve, precision=precision
             )
             known = errors.get(method, {})
             for batch in batches:
@@ -114,14 +113,14 @@ def network_costs(
                     jax.devices()[0].device_kind,
                     batch,
                     number,
-                    _mean(known, worn[:number]),
+                    _mean(known, TEMPLATES[:number]),
                     **_clothing(dresser, motion, batch),
                     **(_gradient(dresser, motion, batch) if backward else {}),
                     ms_network=_network(dresser, batch),
                     params=params,
                     weights_mb=weights_size(weights) / 1e6,
                     precision=precision,
-                    rmse_each=_each(known, worn[:number]),
+                    rmse_each=_each(known, TEMPLATES[:number]),
                 )
 
 
@@ -143,7 +142,7 @@ def other_costs(
     """Costs of a method that dresses one garment at a time: their sums.
 
     Args:
-        kind: ``lbs`` or ``simulator``.
+        kind: ``lbs``, ``simulator`` or ``engine``.
         size: Its setting.
         method: How it is asked.
         motion: What the person does.
@@ -152,10 +151,9 @@ def other_costs(
     Yields:
         A row for each number of garments.
     """
-    worn: tuple[Template, ...] = ("top", "bottom", "dress")
     nan = float("nan")
     times, colds = [], []
-    for t in worn:
+    for t in TEMPLATES:
         began = time.perf_counter()
         times.append(method(motion, t).ms_per_frame)
         colds.append(time.perf_counter() - began)
@@ -165,7 +163,7 @@ def other_costs(
             jax.devices()[0].device_kind,
             BLOCK if kind == "lbs" else 1,
             len(times),
-            _mean(errors, worn[: len(times)]),
+            _mean(errors, TEMPLATES[: len(times)]),
             sum(times),
             0.0,
             sum(colds),
@@ -173,7 +171,7 @@ def other_costs(
             nan,
             0.0,
             nan,
-            rmse_each=_each(errors, worn[: len(times)]),
+            rmse_each=_each(errors, TEMPLATES[: len(times)]),
         )
 
 
@@ -204,10 +202,9 @@ def network_errors(
     predictor: Predictor, sequences: Items[Sequence], report: Callable[[], None] | None = None
 ) -> dict[str, dict[Template, float]]:
     """`mean_errors` of a network without and with push-out."""
-    templates: tuple[Template, ...] = ("top", "bottom", "dress")
     return {
-        "network": mean_errors(network(predictor), sequences, templates, report=report),
-        "network+push": mean_errors(pushed_network(predictor), sequences, templates, report=report),
+        "network": mean_errors(network(predictor), sequences, TEMPLATES, report=report),
+        "network+push": mean_errors(pushed_network(predictor), sequences, TEMPLATES, report=report),
     }
 
 

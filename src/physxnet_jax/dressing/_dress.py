@@ -24,7 +24,7 @@ from ..motion import (
 )
 from ..simulation import ACCURACY
 from ..uv import Binding, Transference, bind
-from ._blocks import inside_share, predict_clip, simulate_clip
+from ._blocks import inside_share, lift_clip, predict_clip, simulate_clip
 from ._character import (
     Character,
     clear_of_character,
@@ -202,6 +202,8 @@ def dress(
                     w.name: clear_of_character(p, w, person, positions[w.name], world, shift)
                     for w, p in zip(wearables, patches, strict=True)
                 }
+                # What was moved off the person's skin may have moved through what is over it.
+                positions = lift_clip(layers, wearables, positions)
             inside = {g.name: inside_character(person, positions[g.name]) for g in garments}
         meshes = animated_meshes(body, clip, shape, garments, positions, include_body)
         if person is not None and include_body:

@@ -7,7 +7,7 @@ import jax
 from jaxtyping import Array
 
 from ..body import load_body
-from ..evaluation import NOISE, Blockwise, Method, Simulator, network, skinning
+from ..evaluation import ENGINES, NOISE, Blockwise, Method, Simulator, engine, network, skinning
 from ..garment import Template, template
 from ..io import MIRROR, load_predictor
 from ..models import Predictor, Wearable, dress_frames
@@ -32,7 +32,7 @@ def pushed_network(predictor: Predictor) -> Blockwise:
 
 
 def method_by_name(name: str) -> Method:
-    """A way to dress by its name: ``lbs``, an accuracy of the simulator, a network's.
+    """A way to dress by its name: ``lbs``, the simulator's accuracy, an engine's, a network's.
 
     ``noise`` is the simulator from almost the same start: how far two runs part that
     should be one is the least error that means anything.
@@ -52,6 +52,8 @@ def method_by_name(name: str) -> Method:
         return Simulator("standard", moved=NOISE)
     if name in ACCURACY:
         return Simulator(name)
+    if name in ENGINES:
+        return engine(name)
     predictor = load_predictor(weights_folder(name.removesuffix("+push")))
     return pushed_network(predictor) if name.endswith("+push") else network(predictor)
 

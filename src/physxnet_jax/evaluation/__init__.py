@@ -23,11 +23,13 @@ from ._evaluate import (
     retime as retime,
 )
 from ._methods import (
+    ENGINES as ENGINES,
     NOISE as NOISE,
     Answer as Answer,
     Blockwise as Blockwise,
     Method as Method,
     Simulator as Simulator,
+    engine as engine,
     network as network,
     rest_and_skin as rest_and_skin,
     skinning as skinning,

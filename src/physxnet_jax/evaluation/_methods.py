@@ -23,9 +23,23 @@ from ..models import (
     skin_points,
 )
 from ..motion import BLOCK, Motion, clip_transforms, padded_block
-from ..simulation import ACCURACY, PreparedScene, Scene, prepare_scene, simulate_batch
+from ..simulation import (
+    ACCURACY,
+    PreparedScene,
+    Rollout,
+    Scene,
+    prepare_scene,
+    simulate_batch,
+)
+from ..simulation.blender import simulate_blender
+from ..simulation.newton import simulate_newton
 from ..uv import bind
 
+# Cloth of other makers, out of process.
+ENGINES: dict[str, Callable[[Scene, Motion], Rollout]] = {
+    "blender": simulate_blender,
+    "newton": simulate_newton,
+}
 # Displacement of the body's root that shows how far simulations part [m].
 NOISE = 1e-6
 
@@ -168,3 +182,19 @@ class Simulator:
         rollout = simulate_batch(self._scenes[name], [moved], solver=solver, progress=tick)[0]
         laps = 1e3 * np.diff(ticks) / np.maximum(np.diff(done), 1)
         return Answer(rollout.positions[0], float(np.median(laps[1:] if len(laps) > 1 else laps)))
+
+
+def engine(name: str) -> Method:
+    """Another maker's cloth as a method: ``blender`` or ``newton``.
+
+    It is another model of cloth: how far it is from our simulator is no error of it.
+    """
+    run = ENGINES[name]
+
+    def method(motion: Motion, name: Template) -> Answer:
+        rollout = run(Scene((template(name),)), motion)
+        # The first frame loads and settles.
+        laps = rollout.diagnostics["milliseconds"]
+        return Answer(rollout.positions[0], float(np.median(laps[1:] if len(laps) > 1 else laps)))
+
+    return method

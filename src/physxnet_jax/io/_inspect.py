@@ -5,6 +5,7 @@ import pathlib
 import shlex
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from ..body import Body, load_body
 from ..errors import MeshError
@@ -30,6 +31,14 @@ from ._obj import read_obj, write_obj
 
 # Shares and lengths beyond which a garment is worth a word [1], [m].
 _INSIDE, _LONG, _FINE, _MISSED = 0.02, 0.04, 0.003, 0.1
+# Sizes within which meshes are alike, and what turning one has to gain [m].
+_UNLIKE, _TURNED = 0.1, 0.001
+# Rotations that make an axis of a file Y.
+_UPRIGHT = {
+    "Y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "Z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "X": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
+}
 # Lifting ends a little short of what it aims at.
 _LIFT = 1.3
 
@@ -49,7 +58,9 @@ class Inspection:
         farthest: Largest distance to the skin [m].
         inside: Share of vertices inside the body or within 3 mm of it.
         outward: Share of faces that look away from the body.
-        template: The template that dresses it.
+        template: The template that dresses it: by what it covers.
+        apart: How far it and each template lie apart on the body [m]: the mean distance of
+            vertices of one from the nearest of the other, of the two ways the larger.
         hit_rate: Share of vertices whose ray meets the body.
         problems: What is wrong, a sentence each; what can't be mended first.
         notes: What is good to know but harms nothing.
@@ -67,6 +78,7 @@ class Inspection:
     inside: float
     outward: float
     template: Template | None
+    apart: dict[Template, float]
     hit_rate: float
     problems: tuple[str, ...]
     notes: tuple[str, ...]
@@ -107,7 +119,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         nan = float("nan")
         command = _command(path, options)
         return Inspection(
-            path, None, None, size, health, raw.polygons, nan, nan, nan, nan, None, nan,
+            path, None, None, size, health, raw.polygons, nan, nan, nan, nan, None, {}, nan,
             tuple(problems), (), command,
         )  # fmt: skip
     mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
@@ -157,8 +169,8 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         )
     return Inspection(
         path, unit, up, size, health, raw.polygons, float(np.median(np.abs(distance))),
-        float(distance.max()), inside, outward, garment.template, hit_rate, tuple(problems),
-        tuple(notes), _command(path, options) if problems else None,
+        float(distance.max()), inside, outward, garment.template, _apart(v), hit_rate,
+        tuple(problems), tuple(notes), _command(path, options) if problems else None,
     )  # fmt: skip
 
 
@@ -176,7 +188,7 @@ def fit_garment(
     Args:
         path: An ``.obj`` file.
         out: The ``.obj`` to write: metres, Y up, on the body at rest.
-        like: Scale and move it onto this template's place instead of guessing its unit.
+        like: Turn, scale and move it onto this template's place instead of guessing its unit.
         edge_length: Split edges longer than this [m].
         coarser: Before that, decimate to about this edge length [m]; texture coordinates
             are lost.
@@ -249,30 +261,47 @@ def fit_garment(
 
 
 def _like(vertices: np.ndarray, wanted: Garment, skin: TriMesh) -> tuple[np.ndarray, str, float]:
-    """The mesh scaled and moved onto a template's box, how, and how far off it is [m].
+    """The mesh turned, scaled and moved onto a template's box, how, and how far off it is [m].
 
-    Whichever axis is up is found by its mean distance from the skin; sizes across count
-    as well, so that trousers aren't taken for a top.
+    Whichever axis is up and wherever the front is are found by the mean distance from the
+    skin; sizes count as well, so that trousers aren't taken for a top.
     """
     x = np.asarray(wanted.mesh.vertices, np.float64)
     low, high = x.min(axis=0), x.max(axis=0)
+    tried = []
+    for up, turns in _UPRIGHT.items():
+        upright = vertices @ np.array(turns, np.float64).T
+        for quarter in range(4):
+            size = np.ptp(upright, axis=0)
+            if size[1] > 0:
+                scale = float((high - low)[1] / size[1])
+                unlike = float(np.mean(np.abs(scale * size - (high - low))))
+                middle = upright.min(axis=0) + 0.5 * size
+                placed = (upright - middle) * scale + 0.5 * (low + high)
+                tried.append((unlike, up, quarter, scale, placed))
+            upright = upright[:, [2, 1, 0]] * [1.0, 1.0, -1.0]
     best = (vertices, "it has no height.", np.inf)
-    for up, turned in (
-        ("Y", vertices),
-        ("Z", vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]),
-    ):
-        size = np.ptp(turned, axis=0)
-        if not size[1] > 0:
+    for unlike, up, quarter, scale, placed in tried:
+        # What has another shape altogether needn't be compared with the skin.
+        if unlike > min(t[0] for t in tried) + _UNLIKE:
             continue
-        scale = float((high - low)[1] / size[1])
-        middle = turned.min(axis=0) + 0.5 * size
-        v = (turned - middle) * scale + 0.5 * (low + high)
-        distance, _ = clearance(skin, v.astype(np.float32))
-        off = float(np.mean(np.abs(distance)) + np.mean(np.abs(scale * size - (high - low))))
-        if off < best[2]:
-            told = f"scaled by {scale:.4g}, {up} up, moved to where a {wanted.template} is."
-            best = (v, told, off)
+        distance, _ = clearance(skin, placed.astype(np.float32))
+        off = float(np.mean(np.abs(distance))) + unlike
+        # A mesh that could as well stay as it is isn't turned.
+        if off + (_TURNED if quarter else 0.0) < best[2]:
+            about = f", turned by {90 * quarter} degrees about it" if quarter else ""
+            told = f"scaled by {scale:.4g}, {up} up{about}, moved to where a {wanted.template} is."
+            best = (placed, told, off)
     return best
+
+
+def _apart(vertices: np.ndarray) -> dict[Template, float]:
+    out: dict[Template, float] = {}
+    for name in TEMPLATES:
+        other = np.asarray(template(name).mesh.vertices)
+        ways = ((vertices, other), (other, vertices))
+        out[name] = max(float(KDTree(a).query(b)[0].mean()) for a, b in ways)
+    return out
 
 
 def _hit_rate(body: Body, garment: Garment) -> float:

@@ -7,6 +7,7 @@ from ..errors import MissingDependencyError
 from ..files import whole_file
 
 # Of methods beyond the tenth: colours come again.
+_LINES = ("--", "-.")
 _MARKS = "osD^"
 
 
@@ -14,6 +15,7 @@ def draw_work_precision(
     path: str | pathlib.Path,
     points: Sequence[tuple[str, str, float, float]],
     floors: Mapping[str, float],
+    times: Mapping[str, Mapping[str, float]] | None = None,
 ) -> pathlib.Path:
     """Error against time, a panel for each scene, both axes logarithmic.
 
@@ -22,6 +24,7 @@ def draw_work_precision(
         points: Scene, method, error [mm] and time [ms a frame]; those of a method are
             joined in the order given.
         floors: Noise floor of a scene [mm]; a point below it is drawn hollow.
+        times: By scene, methods of which only the time is known [ms a frame].
 
     Raises:
         MissingDependencyError: matplotlib isn't installed.
@@ -38,6 +41,8 @@ def draw_work_precision(
     figure = Figure(figsize=(4.6 * max(len(scenes), 1), 4.6), layout="constrained")
     FigureCanvasAgg(figure)
     methods = list(dict.fromkeys(p[1] for p in points))
+    timed = dict.fromkeys(name for known in (times or {}).values() for name in known)
+    lines = {name: _LINES[k % len(_LINES)] for k, name in enumerate(timed)}
     for k, scene in enumerate(scenes):
         axes = figure.add_subplot(1, len(scenes), k + 1)
         for m, method in enumerate(methods):
@@ -54,6 +59,8 @@ def draw_work_precision(
                 axes.plot([t], [e], mark, color=colour, mfc="white" if below else colour)
         if scene in floors:
             axes.axhline(floors[scene], color="grey", ls=":", lw=1, label="noise floor")
+        for name, time in ((times or {}).get(scene) or {}).items():
+            axes.axvline(time, color="black", ls=lines[name], lw=1, label=name)
         axes.set(xscale="log", yscale="log", title=scene, xlabel="time [ms a frame]")
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylabel("error, rms [mm]")

@@ -14,6 +14,7 @@ import numpy as np
 from ..body import load_body
 from ..dressing import animated_meshes, dress, fit_surface, load_ladder, make_scene
 from ..errors import PhysXNetError
+from ..garment import FABRICS
 from ..io import DEFAULT, AnimatedMesh, load_predictor, read_card
 from ..models import Predictor
 from ..motion import BLOCK, Motion, clip_transforms, load_motion, stand_on_floor
@@ -120,10 +121,13 @@ def check_choice(choice: Choice) -> None:
     """Refuses what no computation could carry out.
 
     Raises:
-        PhysXNetError: No frame is asked for, or there are no such weights.
+        PhysXNetError: No frame is asked for, or there is no such fabric, shape or network.
     """
     if choice.frames < 1:
         raise PhysXNetError(f"frames is {choice.frames}; ask for at least one.")
+    if choice.fabric is not None and choice.fabric not in FABRICS:
+        raise PhysXNetError(f"No fabric '{choice.fabric}'; there are {', '.join(FABRICS)}.")
+    _shape(choice)
     if choice.method == "network":
         read_card(choice.weights)
 

@@ -251,8 +251,9 @@ class Viewer:
         body, told = load_body(), dict(choice.shape)
         with gui.add_folder("Body", expand_by_default=False):
             for name, x in zip(body.shape_names, np.asarray(body.default_shape()), strict=True):
+                value = round(told.get(name, float(x)), 2)
                 self._shapes[name] = gui.add_slider(
-                    name.replace("_", " "), 0.0, 1.0, 0.05, round(told.get(name, float(x)), 2)
+                    name.replace("_", " "), min(0.0, value), max(1.0, value), 0.05, value
                 )
         with gui.add_folder("Play"):
             self._playing = gui.add_checkbox("play", True)
