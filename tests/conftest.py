@@ -8,11 +8,6 @@ import pytest
 
 jaxtyping.install_import_hook("physxnet_jax", "beartype.beartype")
 
-# Without its newer emitters XLA compiles these many programs in two thirds of the time.
-# Processes of their own, as users start them, compile as XLA does by itself.
-_FLAGS = os.environ.get("XLA_FLAGS")
-os.environ["XLA_FLAGS"] = f"{_FLAGS or ''} --xla_cpu_use_fusion_emitters=false".strip()
-
 import jax  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
@@ -21,11 +16,6 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 _CACHE = pathlib.Path(__file__).parents[1] / ".pytest_cache" / "xla"
 jax.config.update("jax_compilation_cache_dir", str(_CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-jax.devices()
-if _FLAGS is None:
-    del os.environ["XLA_FLAGS"]
-else:
-    os.environ["XLA_FLAGS"] = _FLAGS
 # For what tests start as processes of their own.
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(_CACHE)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
