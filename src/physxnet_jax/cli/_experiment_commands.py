@@ -150,8 +150,8 @@ class Evaluate:
     """The error of methods on every action of a dataset, beside what each costs.
 
     Methods: lbs, nearest, mlp, draft, standard, fine, noise, names of weights, folders of
-    weights or of runs. With +push after a network's name its vertices are pushed out of
-    the body.
+    weights or of runs; blender and newton, which model another cloth. With +push after a
+    network's name its vertices are pushed out of the body.
 
     Examples:
       physxnet evaluate local local+push lbs --data runs/ours --out out/errors.json

@@ -12,7 +12,7 @@ from rich.table import Table
 from ..body import load_body
 from ..dressing import SceneFile, animated_meshes, load_scene, make_scene
 from ..errors import FormatError
-from ..evaluation import price_effects, recommend_effects
+from ..evaluation import ENGINES, price_effects, recommend_effects
 from ..files import whole_file
 from ..io import check_output, write_clip
 from ..simulation import (
@@ -26,8 +26,6 @@ from ..simulation import (
     prepare_scene,
     simulate_batch,
 )
-from ..simulation.blender import simulate_blender
-from ..simulation.newton import simulate_newton
 from ..viewer import check_preview, render_preview
 from ._commands import Effects, Simulate
 from ._progress import print_json, progress_bars
@@ -70,9 +68,8 @@ def simulate(command: Simulate, console: Console) -> int:
         def progress(done: int, total: int) -> None:
             bars("simulation", done, total)
 
-        if command.engine in ("blender", "newton"):
-            run = simulate_blender if command.engine == "blender" else simulate_newton
-            rollout = run(scene, job.motion, progress=progress)
+        if command.engine in ENGINES:
+            rollout = ENGINES[command.engine](scene, job.motion, progress=progress)
         else:
             solver = Implicit(16, 4) if command.engine == "bdf2" else ACCURACY[accuracy]
             solver = solver.at_rate(job.motion.fps)

@@ -36,7 +36,7 @@ from ..simulation.newton import simulate_newton
 from ..uv import bind
 
 # Cloth of other makers, out of process.
-ENGINES: dict[str, Callable[[Scene, Motion], Rollout]] = {
+ENGINES: dict[str, Callable[..., Rollout]] = {
     "blender": simulate_blender,
     "newton": simulate_newton,
 }

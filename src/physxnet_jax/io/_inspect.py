@@ -280,10 +280,11 @@ def _like(vertices: np.ndarray, wanted: Garment, skin: TriMesh) -> tuple[np.ndar
                 placed = (upright - middle) * scale + 0.5 * (low + high)
                 tried.append((unlike, up, quarter, scale, placed))
             upright = upright[:, [2, 1, 0]] * [1.0, 1.0, -1.0]
+    alike = min((t[0] for t in tried), default=0.0) + _UNLIKE
     best = (vertices, "it has no height.", np.inf)
     for unlike, up, quarter, scale, placed in tried:
         # What has another shape altogether needn't be compared with the skin.
-        if unlike > min(t[0] for t in tried) + _UNLIKE:
+        if unlike > alike:
             continue
         distance, _ = clearance(skin, placed.astype(np.float32))
         off = float(np.mean(np.abs(distance))) + unlike

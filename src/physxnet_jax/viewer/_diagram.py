@@ -7,8 +7,8 @@ from ..errors import MissingDependencyError
 from ..files import whole_file
 
 # Of methods beyond the tenth: colours come again.
-_LINES = ("--", "-.")
 _MARKS = "osD^"
+_LINES = ("--", "-.")
 
 
 def draw_work_precision(
@@ -41,7 +41,8 @@ def draw_work_precision(
     figure = Figure(figsize=(4.6 * max(len(scenes), 1), 4.6), layout="constrained")
     FigureCanvasAgg(figure)
     methods = list(dict.fromkeys(p[1] for p in points))
-    timed = dict.fromkeys(name for known in (times or {}).values() for name in known)
+    times = times or {}
+    timed = dict.fromkeys(name for known in times.values() for name in known)
     lines = {name: _LINES[k % len(_LINES)] for k, name in enumerate(timed)}
     for k, scene in enumerate(scenes):
         axes = figure.add_subplot(1, len(scenes), k + 1)
@@ -59,8 +60,8 @@ def draw_work_precision(
                 axes.plot([t], [e], mark, color=colour, mfc="white" if below else colour)
         if scene in floors:
             axes.axhline(floors[scene], color="grey", ls=":", lw=1, label="noise floor")
-        for name, time in ((times or {}).get(scene) or {}).items():
-            axes.axvline(time, color="black", ls=lines[name], lw=1, label=name)
+        for name, ms in times.get(scene, {}).items():
+            axes.axvline(ms, color="black", ls=lines[name], lw=1, label=name)
         axes.set(xscale="log", yscale="log", title=scene, xlabel="time [ms a frame]")
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_ylabel("error, rms [mm]")
