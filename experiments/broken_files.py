@@ -18,7 +18,14 @@ import numpy as np
 from physxnet_jax.dressing import load_scene
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.files import whole_file
-from physxnet_jax.io import load_predictor, read_character, read_mdd, read_obj, read_pc2
+from physxnet_jax.io import (
+    load_predictor,
+    read_character,
+    read_mdd,
+    read_mesh,
+    read_obj,
+    read_pc2,
+)
 from physxnet_jax.motion import load_motion, read_joint_map
 
 RESULT = pathlib.Path(__file__).parent / "results/broken_files.md"
@@ -30,6 +37,20 @@ BVH = (
     + "\nEnd Site\n{\nOFFSET 0 -1 0\n}\n}\n}\nMOTION\nFrames: 1\nFrame Time: 0.0083333\n"
     "0 1 0 0 0 0 0 0 0\n"
 )
+PLY = (
+    b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+    b"property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+)
+USDA = """#usda 1.0
+def Mesh "shirt" (prepend apiSchemas = ["SkelBindingAPI"])
+{
+    int[] faceVertexCounts = [3]
+    int[] faceVertexIndices = [0, 1, 2]
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (0, 1, 0)]
+    matrix4d primvars:skel:geomBindTransform = BIND
+}
+"""
 OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 
 
@@ -102,6 +123,13 @@ def corpus() -> list[tuple[str, str, bytes, Callable[[pathlib.Path], object]]]:
         ("index zero", "a.obj", OBJ.replace("f 1 2 3", "f 0 1 2").encode(), read_obj),
         ("infinite", "a.obj", OBJ.replace("v 1 0 0", "v 1e999 0 0").encode(), read_obj),
         ("binary", "a.obj", b"\0\0\0\0", read_obj),
+        ("no such format", "shirt.fbx", b"Kaydara FBX Binary", read_mesh),
+        ("a billion vertices announced", "shirt.ply", PLY.replace(b"vertex 3", b"vertex 1000000000"), read_mesh),
+        ("faces that lead nowhere", "shirt.ply", PLY.replace(b"3 0 1 2", b"3 0 1 9"), read_mesh),
+        ("a billion triangles announced", "shirt.stl", b"\0" * 80 + np.array([10**9], "<u4").tobytes(), read_mesh),
+        ("faces that lead nowhere", "shirt.usda", USDA.replace("0, 1, 2]", "0, 1, 9]").replace("= BIND", "= ((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,0,1))").encode(), read_mesh),
+        ("bound by no matrix", "shirt.usda", USDA.replace("matrix4d", "float").replace("BIND", "1").encode(), read_mesh),
+        ("no mesh", "shirt.gltf", gltf(), read_mesh),
         ("truncated cache", "a.pc2", b"POINTCACHE2\0" + view + b"\0" * 12, read_pc2),
         ("truncated cache", "a.mdd", b"\0\0\0\5\0\0\0\5\0\0", read_mdd),
         ("a person without faces", "me.npz", archive(positions=np.zeros((2, 9, 3))), read_character),

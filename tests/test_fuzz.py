@@ -17,11 +17,19 @@ import tracemalloc
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from physxnet_jax.dressing import load_scene
 from physxnet_jax.errors import PhysXNetError
-from physxnet_jax.io import load_predictor, read_character, read_mdd, read_obj, read_pc2
+from physxnet_jax.io import (
+    load_predictor,
+    read_character,
+    read_mdd,
+    read_mesh,
+    read_obj,
+    read_pc2,
+)
 from physxnet_jax.motion import load_motion, read_amc, read_bvh, read_joint_map
 
 _SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[0] / "samples.py"))
@@ -29,6 +37,11 @@ BVH, ASF, AMC = (_SAMPLES[name] for name in ("BVH", "ASF", "AMC"))
 OBJ = "o a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 1\nvt 0 0\nvt 1 1\nf 1/1 2/2 3/1\nf 2 4 3\nf -1 -2 -3 -4\n"
 SCENE = (
     'motion = "balance"\nframes = 2\ngarments = ["bottom"]\n[also.air]\nwind = [0.0, 0.0, 4.0]\n'
+)
+PLY = (
+    b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"
+    b"property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    b"0 0 0\n1 0 0\n0 1 0\n1 1 1\n3 0 1 2\n3 1 3 2\n"
 )
 NAMES = 'Hips = "a"\nLeftLeg = "b"\n'
 
@@ -130,6 +143,27 @@ def Mesh "body"
 """
 
 
+def _garment_usda(folder):
+    return b"""#usda 1.0
+def Mesh "shirt" (prepend apiSchemas = ["SkelBindingAPI"])
+{
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)]
+    texCoord2f[] primvars:st = [(0, 0), (1, 0)] (interpolation = "faceVarying")
+    int[] primvars:st:indices = [0, 1, 1, 0]
+    matrix4d primvars:skel:geomBindTransform = ((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,0,1))
+    double3 xformOp:translate = (9, 0, 0)
+    uniform token[] xformOpOrder = ["xformOp:translate"]
+}
+"""
+
+
+def _exported(kind):
+    box = trimesh.creation.box()
+    return box.export(file_type=kind)
+
+
 def _skin(folder):
     """Two triangles that hang on the figure's hips."""
     document = json.loads(_gltf(folder))
@@ -211,6 +245,11 @@ READERS = {
     "character": (_character, ".npz", read_character, 60),
     "usd": (_usda, ".usda", read_character, 60),
     "skin": (_skin, ".gltf", read_character, 150),
+    "garment skin": (_skin, ".gltf", read_mesh, 150),
+    "garment usd": (_garment_usda, ".usda", read_mesh, 150),
+    "ply": (lambda f: PLY, ".ply", read_mesh, 150),
+    "binary ply": (lambda f: _exported("ply"), ".ply", read_mesh, 150),
+    "stl": (lambda f: _exported("stl"), ".stl", read_mesh, 150),
     "card": (_weights("card.json"), ".json", _card, 20),
     "tensors": (_weights("weights.safetensors"), ".safetensors", _tensors, 12),
 }
@@ -280,6 +319,11 @@ def test_damaged_files_are_read_or_refused(name, tmp_path):
 HUGE = {
     "bvh": BVH.replace("Frames: 2", "Frames: 1000000000").encode(),
     "obj": OBJ.replace("f 2 4 3", "f 2 4 999999999").encode(),
+    "ply": PLY.replace(b"vertex 4", b"vertex 999999999"),
+    "binary ply": PLY.replace(b"ascii", b"binary_little_endian").replace(
+        b"vertex 4", b"vertex 999999999"
+    ),
+    "stl": b"\0" * 80 + np.array([10**9], "<u4").tobytes() + b"\0" * 100,
     "pc2": b"POINTCACHE2\0" + np.array([1, 10**9], "<i4").tobytes() + b"\0" * 12,
     "mdd": np.array([10**9, 10**9], ">i4").tobytes() + b"\0" * 64,
 }

@@ -11,6 +11,7 @@ import zipfile
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import trimesh
 from rich.console import Console
 
 from physxnet_jax.cli import main, parse
@@ -128,10 +129,11 @@ def test_what_is_taken_away_is_what_is_shown(viewer, tmp_path):
         assert name == "walk.zip" and len(archive.namelist()) == 4
         (obj,) = (n for n in archive.namelist() if n.endswith("bottom.obj"))
         (tmp_path / "bottom.obj").write_bytes(archive.read(obj))
-    viewer.add_file("mine.obj", (tmp_path / "bottom.obj").read_bytes())
     assert len(read_obj(tmp_path / "bottom.obj").vertices) == 2726
+    # A glTF in which nothing moves isn't taken for a motion.
+    viewer.add_file("mine.glb", trimesh.load_mesh(tmp_path / "bottom.obj").export(file_type="glb"))
     assert [m.name for m in viewer.wait().garments] == ["bottom", "mine"]
-    viewer._worn["mine.obj"].value = False
+    viewer._worn["mine.glb"].value = False
     viewer.wait()
 
 

@@ -22,8 +22,9 @@ class Dress:
     motion: tyro.conf.Positional[str]
     """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
     wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and OBJ files (coat.obj=top says what one is dressed as): tops
-    over dresses over trousers, of two of one kind the second over the first."""
+    """Templates (top, bottom, dress) and files (.obj, .glb, .gltf, .usd*, .ply, .stl; coat.obj=top
+    says what one is dressed as): tops over dresses over trousers, of two of one kind the second
+    over the first."""
     own_body: bool = False
     """The file is a person of your own to be dressed: .glb, .usd, .pc2, .mdd (with OBJ), .npz."""
     body_mesh: str | None = None
@@ -72,11 +73,12 @@ class Inspect:
 
     Examples:
       physxnet inspect my_shirt.obj
-      physxnet inspect *.obj --json
+      physxnet inspect coat.glb coat.glb#sleeves --json
     """
 
     files: tyro.conf.Positional[tuple[pathlib.Path, ...]]
-    """OBJ files."""
+    """Garments: .obj, .glb, .gltf, .usd, .usda, .usdc, .ply, .stl; coat.glb#sleeves is one mesh of
+    several."""
     json: bool = False
     """Print JSON for machines instead of tables."""
     debug: bool = False
@@ -93,7 +95,7 @@ class Fit:
     """
 
     file: tyro.conf.Positional[pathlib.Path]
-    """An OBJ file; it isn't changed."""
+    """A garment, as `physxnet inspect` reads it; it isn't changed."""
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
     """The OBJ to write: metres, Y up, on the body at rest."""
     like: Literal["top", "bottom", "dress"] | None = None

@@ -2,16 +2,16 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from ..errors import FormatError
 from ..files import read_arrays
 from ..motion import nominal_rate
 from ._clip import AnimatedMesh
 from ._mdd import read_mdd
+from ._moving import Moving, joined, named
 from ._obj import read_obj
 from ._pc2 import read_pc2
 
@@ -24,27 +24,6 @@ _FARTHEST = 1e18
 # Heights of a person [m], grown or a child, in units that programs write.
 _HEIGHTS = (0.8, 2.6)
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254}
-
-
-@dataclasses.dataclass(frozen=True)
-class Moving:
-    """A part of a file: a mesh that moves, in the file's own unit and axes.
-
-    Attributes:
-        name: Its name there.
-        positions: Shape [frames, vertices, 3].
-        faces: Triangles.
-        uv: Texture coordinates; or None.
-        uv_faces: Corners in ``uv``; or None.
-        bind: The pose in which a skin was bound, shape [vertices, 3]; or None.
-    """
-
-    name: str
-    positions: Float[np.ndarray, "frames vertices 3"]
-    faces: Int[np.ndarray, "faces 3"]
-    uv: Float[np.ndarray, "uvs 2"] | None = None
-    uv_faces: Int[np.ndarray, "faces 3"] | None = None
-    bind: Float[np.ndarray, "vertices 3"] | None = None
 
 
 def read_character(
@@ -100,14 +79,18 @@ def read_character(
     # What a damaged file holds may be infinite; it is refused below.
     with np.errstate(all="ignore"):
         parts, rate, up = read(path, fps)
-    chosen = _picked(path, parts, mesh)
+    if not parts:
+        raise FormatError(f"{path}: no mesh that moves. Export the person with its animation.")
+    if mesh is None:
+        parts = [p for p in parts if p.name.lower() == "body"] or parts
+    chosen = named(path, parts, mesh, "Say another (--body-mesh)")
     if len({len(p.positions) for p in chosen}) > 1 or not len(chosen[0].positions):
         counts = ", ".join(f"{p.name} {len(p.positions)}" for p in chosen[:6])
         raise FormatError(
             f"{path}: meshes with {counts} frames. Export them over one range, or choose one with"
             " --body-mesh."
         )
-    whole = _joined(chosen)
+    whole = joined(chosen)
     if whole.positions.size > _MOST:
         raise FormatError(f"{path}: {whole.positions.size:,} coordinates. Cut the clip.")
     # Beyond that their squares aren't finite in float32.
@@ -188,43 +171,6 @@ def _read_cache(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | N
             " vertices. Export both from one mesh, vertex order kept."
         )
     return [Moving("body", positions, shape.faces, shape.uv, shape.uv_faces)], rate, None
-
-
-def _picked(path: pathlib.Path, parts: Sequence[Moving], mesh: str | None) -> list[Moving]:
-    if not parts:
-        raise FormatError(f"{path}: no mesh that moves. Export the person with its animation.")
-    names = ", ".join(sorted({p.name for p in parts}))[:300]
-    if mesh is not None:
-        chosen = [p for p in parts if p.name == mesh]
-        if not chosen:
-            raise FormatError(f"{path}: no mesh '{mesh}'; there are {names}.")
-        return chosen
-    return [p for p in parts if p.name.lower() == "body"] or list(parts)
-
-
-def _joined(parts: Sequence[Moving]) -> Moving:
-    if len(parts) == 1:
-        return parts[0]
-    first = np.cumsum([0, *(p.positions.shape[1] for p in parts)])
-    faces = [p.faces + n for p, n in zip(parts, first[:-1], strict=True)]
-    binds = [p.bind for p in parts]
-    uv = uv_faces = None
-    if all(p.uv is not None and p.uv_faces is not None for p in parts):
-        starts = np.cumsum([0, *(len(p.uv) for p in parts if p.uv is not None)])
-        uv = np.concatenate([p.uv for p in parts if p.uv is not None])
-        uv_faces = np.concatenate(
-            [p.uv_faces + n for p, n in zip(parts, starts) if p.uv_faces is not None]
-        )
-    return Moving(
-        "body",
-        np.concatenate([p.positions for p in parts], axis=1),
-        np.concatenate(faces),
-        uv,
-        uv_faces,
-        None
-        if any(b is None for b in binds)
-        else np.concatenate([b for b in binds if b is not None]),
-    )
 
 
 def _at_rate(moving: Moving, rate: float, fps: float, frames: int | None) -> Moving:

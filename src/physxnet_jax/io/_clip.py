@@ -1,4 +1,4 @@
-"""What writers write: animated meshes of one clip."""
+"""What readers read and writers write: meshes at rest and in motion."""
 
 import dataclasses
 
@@ -25,6 +25,27 @@ class AnimatedMesh:
     uv: Float[np.ndarray, "uvs 2"] | None = None
     uv_faces: Int[np.ndarray, "faces 3"] | None = None
     colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+
+
+@dataclasses.dataclass(frozen=True)
+class StillMesh:
+    """A mesh as its file has it, triangulated.
+
+    Attributes:
+        vertices: Positions in the file's unit, in the file's order, shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        uv: Texture coordinates, shape [uvs, 2]; None if any face lacks them.
+        uv_faces: Corners in ``uv``, shape [faces, 3]; None likewise.
+        polygons: Number of faces before triangulation.
+        parts: Names of the meshes that it was put together from, where files name them.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    uv: Float[np.ndarray, "uvs 2"] | None
+    uv_faces: Int[np.ndarray, "faces 3"] | None
+    polygons: int
+    parts: tuple[str, ...] = ()
 
 
 def vertex_velocities(

@@ -30,7 +30,8 @@ from ..geometry import (
     nearby_faces,
     vertex_normals,
 )
-from ._obj import ObjMesh, read_obj
+from ._clip import StillMesh
+from ._mesh_file import GARMENT_FORMATS, mesh_name, read_mesh
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
 NEAREST = 0.003
@@ -68,15 +69,16 @@ def load_garment(
     body: Body | None = None,
     kind: Template | None = None,
 ) -> tuple[Garment, GarmentReport]:
-    """A garment from an OBJ file modelled on the body, or a template by name.
+    """A garment from a file modelled on the body, or a template by name.
 
     The unit and up axis are those that put the mesh on the body. Vertices inside the
     skin are moved 3 mm out. Each vertex is carried by the closest skin; far from it the
     skinning weights are smoothed, so that a skirt isn't torn between the legs.
 
     Args:
-        path: An ``.obj`` file, or ``top``, ``bottom`` or ``dress``. ``coat.obj=top`` says what
-            a file is dressed as, as ``kind`` does.
+        path: A file that `read_mesh` reads (``coat.glb#sleeves`` takes one mesh of several), or
+            ``top``, ``bottom`` or ``dress``. ``coat.obj=top`` says what a file is dressed as, as
+            ``kind`` does.
         body: The body; the built-in one by default.
         kind: Template to dress it by; guessed from what it covers if omitted.
 
@@ -105,12 +107,11 @@ def load_garment(
         )
         return g, report
     path = pathlib.Path(path)
-    if path.suffix.lower() != ".obj":
+    if not path.suffix:
         raise MeshError(
-            f"{path}: garments are OBJ files or one of {', '.join(TEMPLATES)}. Export the"
-            " mesh as OBJ (triangles or quads, with uv)."
+            f"{path}: garments are {', '.join(TEMPLATES)} or files ({', '.join(GARMENT_FORMATS)})."
         )
-    raw = read_obj(path)
+    raw = read_mesh(path)
     rest = body.rest_vertices(body.default_shape())
     mesh = body.rest_mesh()
     skin = np.asarray(mesh.vertices)
@@ -140,7 +141,7 @@ def load_garment(
         jnp.asarray(weights.astype(np.float32)),
         COTTON,
         kind,
-        path.stem,
+        mesh_name(path),
     )
     report = GarmentReport(
         unit,
@@ -210,7 +211,7 @@ def guess_template(
     return "bottom" if len(low) >= 2 else "dress"
 
 
-def _smooth_far(weights: np.ndarray, raw: ObjMesh, distance: np.ndarray) -> np.ndarray:
+def _smooth_far(weights: np.ndarray, raw: StillMesh, distance: np.ndarray) -> np.ndarray:
     """Skinning weights averaged over the mesh where the skin is far away."""
     average = smoothing_matrix(raw.faces, len(weights))
     share = np.clip((distance - 0.02) / 0.04, 0.0, 1.0)[:, None]

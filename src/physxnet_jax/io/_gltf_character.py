@@ -1,13 +1,15 @@
 """Meshes of a glTF as its animation moves them: skins and morph targets."""
 
+import contextlib
 import pathlib
+from collections.abc import Iterator
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import FormatError, PhysXNetError
 from ..motion import GltfFile
-from ._character import Moving
+from ._moving import Moving, welded
 
 _TRIANGLES = 4
 # Coordinates that are computed at most.
@@ -35,8 +37,28 @@ def read_gltf_meshes(
     References:
         Khronos, glTF 2.0, sections 3.7.2 (meshes) and 3.7.3 (skins).
     """
+    with _damage_told(path):
+        file = GltfFile(path)
+        parts = _read(file, file.frame_times(rate=fps)[0])
+        moving = [p for p in parts if p.bind is not None] or parts
+        return [welded(p) for p in moving], float(fps), "Y"
+
+
+def read_gltf_still(path: pathlib.Path) -> list[Moving]:
+    """Every mesh of a file as its nodes stand, skins as they were bound.
+
+    Raises:
+        FormatError: A mesh without triangles, skin weights that don't fit.
+        MotionError: A damaged file.
+    """
+    with _damage_told(path):
+        return _read(GltfFile(path), None)
+
+
+@contextlib.contextmanager
+def _damage_told(path: pathlib.Path) -> Iterator[None]:
     try:
-        return _read(path, fps)
+        yield
     except (PhysXNetError, OSError):
         raise
     except (TypeError, ValueError, AttributeError, LookupError, OverflowError) as error:
@@ -45,36 +67,36 @@ def read_gltf_meshes(
         ) from error
 
 
-def _read(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, str | None]:
-    file = GltfFile(path)
-    times = file.frame_times(rate=fps)[0]
-    if len(times) * len(file.document.nodes) > _MOST_NODES:
+def _read(file: GltfFile, times: Float[np.ndarray, " frames"] | None) -> list[Moving]:
+    """Meshes at these times; as the file stands without any."""
+    count = 1 if times is None else len(times)
+    if count * len(file.document.nodes) > _MOST_NODES:
         raise FormatError(
-            f"{path}: {len(times):,} frames of {len(file.document.nodes)} nodes are more than are"
+            f"{file.path}: {count:,} frames of {len(file.document.nodes)} nodes are more than are"
             " read. Export a part of the clip, or the person alone."
         )
-    world, still = file.world(times), file.world()[0]
+    still = file.world()[0]
+    world = still[None] if times is None else file.world(times)
     parts: list[Moving] = []
     points = 0
     for n, node in enumerate(file.document.nodes):
         if node.mesh is None:
             continue
         mesh = file.document.meshes[file.index(node.mesh, file.document.meshes, "mesh")]
-        weights = file.morph_weights(n, times)
+        weights = None if times is None else file.morph_weights(n, times)
         for primitive in mesh.primitives:
             if (primitive.mode if primitive.mode is not None else _TRIANGLES) != _TRIANGLES:
                 continue
             name = str(node.name or mesh.name or f"mesh{node.mesh}")
             part = _primitive(file, primitive, name, weights)
             points += part.positions.shape[1]
-            _check_size(file, len(times), points)
+            _check_size(file, count, points)
             if node.skin is not None:
                 part = _skinned(file, node.skin, primitive, part, world, still)
             else:
                 part = _moved(file, part, world[:, n])
             parts.append(part)
-    moving = [p for p in parts if p.bind is not None] or parts
-    return [_welded(p) for p in moving], float(fps), "Y"
+    return parts
 
 
 def _primitive(
@@ -181,23 +203,3 @@ def _joint_weights(
     if not np.isfinite(out).all() or (total <= 0).any():
         raise FormatError(f"{file.path}: vertices of '{part.name}' hang on no joint.")
     return out / total
-
-
-def _welded(part: Moving) -> Moving:
-    """Vertices that were doubled at texture seams become one again."""
-    place = part.positions[0] if part.bind is None else part.bind
-    both = np.concatenate([place, part.positions[-1]], axis=1)
-    keys = np.round(both / max(float(np.ptp(place, axis=0).max()), 1e-9) * 1e6)
-    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-    faces = index.reshape(-1)[part.faces].astype(np.int32)
-    whole = (
-        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    )
-    return Moving(
-        part.name,
-        part.positions[:, first],
-        faces[whole],
-        part.uv,
-        None if part.uv_faces is None else part.uv_faces[whole],
-        None if part.bind is None else part.bind[first],
-    )

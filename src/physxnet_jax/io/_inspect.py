@@ -27,7 +27,8 @@ from ..garment import (
 from ..geometry import TriMesh, make_mesh
 from ..uv import bind, garment_map_rows, make_atlas
 from ._garment import NEAREST, load_garment, place_on_body
-from ._obj import read_obj, write_obj
+from ._mesh_file import mesh_name, read_mesh
+from ._obj import write_obj
 
 # Shares and lengths beyond which a garment is worth a word [1], [m].
 _INSIDE, _LONG, _FINE, _MISSED = 0.02, 0.04, 0.003, 0.1
@@ -96,7 +97,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     """Looks at a garment file and changes nothing.
 
     Args:
-        path: An ``.obj`` file.
+        path: A file that `read_mesh` reads.
         body: The body; the built-in one by default.
 
     Raises:
@@ -104,7 +105,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     """
     path = pathlib.Path(path)
     body = load_body() if body is None else body
-    raw = read_obj(path)
+    raw = read_mesh(path)
     size = tuple(float(s) for s in np.ptp(raw.vertices, axis=0))
     skin = body.rest_mesh()
     problems, notes, options = [], [], []
@@ -160,6 +161,11 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
             f"edges of {1e3 * health.median_edge:.1f} mm: finer than any map here; `physxnet fit"
             " --decimate 8` would make it quicker."
         )
+    if len(raw.parts) > 1:
+        notes.append(
+            f"made of {len(raw.parts)} meshes ({', '.join(raw.parts)[:200]}): `{path}#NAME`"
+            " takes one of them."
+        )
     if health.components > 1:
         notes.append(f"{health.components} parts that nothing joins: each moves by itself.")
     if hit_rate < 1 - _MISSED:
@@ -186,7 +192,7 @@ def fit_garment(
     """Writes a garment that can be worn: on the body, clean, oriented and out of the skin.
 
     Args:
-        path: An ``.obj`` file.
+        path: A file that `read_mesh` reads.
         out: The ``.obj`` to write: metres, Y up, on the body at rest.
         like: Turn, scale and move it onto this template's place instead of guessing its unit.
         edge_length: Split edges longer than this [m].
@@ -209,7 +215,7 @@ def fit_garment(
     if out.resolve() == path.resolve():
         raise MeshError(f"{out}: would overwrite the file it is made from. Name another one.")
     body = load_body() if body is None else body
-    raw = read_obj(path)
+    raw = read_mesh(path)
     skin = body.rest_mesh()
     done = []
     if like is None:
@@ -313,6 +319,6 @@ def _hit_rate(body: Body, garment: Garment) -> float:
 
 
 def _command(path: pathlib.Path, options: list[str]) -> str:
-    out = path.with_name(f"{path.stem}_fitted.obj")
+    out = path.with_name(f"{mesh_name(path)}_fitted.obj")
     words = ["physxnet", "fit", shlex.quote(str(path)), *options, "-o", shlex.quote(str(out))]
     return " ".join(words)

@@ -1,6 +1,5 @@
 """Wavefront OBJ: polygons, texture coordinates, several objects in a file."""
 
-import dataclasses
 import pathlib
 
 import numpy as np
@@ -8,30 +7,12 @@ from jaxtyping import Float, Int
 
 from ..errors import FormatError
 from ..files import whole_file
+from ._clip import StillMesh
 
 _MAX_BYTES = 500_000_000
 
 
-@dataclasses.dataclass(frozen=True)
-class ObjMesh:
-    """An OBJ as it is, triangulated.
-
-    Attributes:
-        vertices: Positions in the file's unit, in the file's order, shape [vertices, 3].
-        faces: Triangles, shape [faces, 3].
-        uv: Texture coordinates, shape [uvs, 2]; None if any face lacks them.
-        uv_faces: Corners in ``uv``, shape [faces, 3]; None likewise.
-        polygons: Number of faces before triangulation.
-    """
-
-    vertices: Float[np.ndarray, "vertices 3"]
-    faces: Int[np.ndarray, "faces 3"]
-    uv: Float[np.ndarray, "uvs 2"] | None
-    uv_faces: Int[np.ndarray, "faces 3"] | None
-    polygons: int
-
-
-def read_obj(path: str | pathlib.Path) -> ObjMesh:
+def read_obj(path: str | pathlib.Path) -> StillMesh:
     """Reads an OBJ; quads are split along their shorter diagonal, others in a fan.
 
     Args:
@@ -85,7 +66,7 @@ def read_obj(path: str | pathlib.Path) -> ObjMesh:
     corners = [c for p in polygons for c in _split(p, v)]
     table = np.asarray(corners)
     has_uv = bool(uv) and bool((table[..., 1] >= 0).all())
-    return ObjMesh(
+    return StillMesh(
         v,
         table[..., 0],
         np.asarray(uv) if has_uv else None,

@@ -1,12 +1,16 @@
 # pyright: reportAttributeAccessIssue=false
 """Meshes of a USD stage over time: points as time samples, or a skin of UsdSkel."""
 
+import contextlib
 import pathlib
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ..errors import FormatError, MissingDependencyError
-from ._character import Moving
+from ._moving import Moving
 
 # Coordinates and frames that are read at most.
 _MOST, _FRAMES = 3e8, 20_000
@@ -28,6 +32,25 @@ def read_usd_meshes(
         FormatError: Damaged, or too long.
         MissingDependencyError: Without usd-core.
     """
+    with _damage_told(path):
+        return _read_moving(path)
+
+
+def read_usd_still(path: pathlib.Path) -> list[Moving]:
+    """Every mesh of a stage as it begins, in world space, skins as they were bound.
+
+    Raises:
+        FormatError: Damaged, or too large.
+        MissingDependencyError: Without usd-core.
+    """
+    with _damage_told(path):
+        stage = _opened(path)
+        code = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
+        return _meshes(path, stage, np.array([code]), bound=True)
+
+
+@contextlib.contextmanager
+def _damage_told(path: pathlib.Path) -> Iterator[None]:
     try:
         from pxr import Tf
     except ImportError as error:
@@ -35,16 +58,16 @@ def read_usd_meshes(
             "Reading USD needs usd-core: pip install 'physxnet-jax[usd]'."
         ) from error
     try:
-        return _read(path)
+        yield
     # What the file quotes in an error needn't be text.
-    except (Tf.ErrorException, UnicodeDecodeError, TypeError, ValueError) as error:
+    except (Tf.ErrorException, UnicodeDecodeError, TypeError, ValueError, LookupError) as error:
         if isinstance(error, FormatError):
             raise
         raise FormatError(f"{path}: not a USD stage, or a damaged one. Export it again.") from None
 
 
-def _read(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
-    from pxr import Usd, UsdGeom, UsdSkel
+def _opened(path: pathlib.Path) -> Any:
+    from pxr import Usd
 
     stage = Usd.Stage.Open(str(path))
     folder = path.parent.resolve()
@@ -54,6 +77,13 @@ def _read(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
                 f"{path}: it refers to '{layer.identifier[:80]}' outside its folder. Put that"
                 " beside it, or flatten the stage."
             )
+    return stage
+
+
+def _read_moving(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
+    from pxr import Usd, UsdGeom, UsdSkel
+
+    stage = _opened(path)
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     rate = stage.GetTimeCodesPerSecond() or 24.0
     if not (np.isfinite([start, end, rate]).all() and 0 <= end - start < _FRAMES and rate > 0):
@@ -63,7 +93,18 @@ def _read(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
         )
     if stage.HasAuthoredTimeCodeRange():
         UsdSkel.BakeSkinning(Usd.PrimRange(stage.GetPseudoRoot()))
-    codes = start + np.arange(int(end - start) + 1)
+    parts = _meshes(path, stage, start + np.arange(int(end - start) + 1), bound=False)
+    moving = [p for p in parts if np.ptp(p.positions, axis=0).max() > 0] or parts
+    up = str(UsdGeom.GetStageUpAxis(stage)) if stage.HasAuthoredMetadata("upAxis") else None
+    return moving, float(rate), up
+
+
+def _meshes(
+    path: pathlib.Path, stage: Any, codes: Float[np.ndarray, " frames"], *, bound: bool
+) -> list[Moving]:
+    """Meshes at these times, in the stage's unit [m]; skins where they were bound, if wanted."""
+    from pxr import Usd, UsdGeom, UsdSkel
+
     # Unsaid it would mean centimetres, which files in metres don't say either.
     said = UsdGeom.StageHasAuthoredMetersPerUnit(stage)
     unit = UsdGeom.GetStageMetersPerUnit(stage) if said else 1.0
@@ -72,18 +113,20 @@ def _read(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
         if not prim.IsA(UsdGeom.Mesh):
             continue
         mesh = UsdGeom.Mesh(prim)
-        first = mesh.GetPointsAttr().Get(start)
+        first = mesh.GetPointsAttr().Get(codes[0])
         counts, corners = (
             mesh.GetFaceVertexCountsAttr().Get(),
             mesh.GetFaceVertexIndicesAttr().Get(),
         )
         if not first or not counts or not corners:
             continue
-        faces = _triangles(np.asarray(counts), np.asarray(corners))
+        slots = _triangles(np.asarray(counts), len(corners))
+        faces = np.asarray(corners)[slots]
         if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(first):
             raise FormatError(f"{path}: faces of {prim.GetPath()} don't fit its points.")
         if mesh.GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded:
-            faces = np.ascontiguousarray(faces[:, ::-1])
+            slots = np.ascontiguousarray(slots[:, ::-1])
+            faces = np.asarray(corners)[slots]
         points += len(first)
         if len(codes) * points * 3.0 > _MOST:
             raise FormatError(f"{path}: {len(codes)} frames of {points:,} points. Cut the clip.")
@@ -93,20 +136,49 @@ def _read(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
             if local.shape != x.shape[1:]:
                 raise FormatError(f"{path}: {prim.GetPath()} changes its number of points.")
             world = np.asarray(UsdGeom.XformCache(code).GetLocalToWorldTransform(prim))
+            skin = UsdSkel.BindingAPI(prim).GetGeomBindTransformAttr()
+            if bound and skin.HasAuthoredValue():
+                world = np.asarray(skin.Get(), float)
+                if world.shape != (4, 4):
+                    raise FormatError(f"{path}: {prim.GetPath()} is bound by no matrix.")
             x[k] = unit * (local @ world[:3, :3] + world[3, :3])
-        parts.append(Moving(prim.GetName(), x, faces))
-    moving = [p for p in parts if np.ptp(p.positions, axis=0).max() > 0] or parts
-    up = str(UsdGeom.GetStageUpAxis(stage)) if stage.HasAuthoredMetadata("upAxis") else None
-    return moving, float(rate), up
+        uv, uv_faces = _chart(prim, slots, faces)
+        parts.append(Moving(prim.GetName(), x, faces, uv, uv_faces))
+    return parts
 
 
-def _triangles(counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Polygons as fans."""
-    if counts.min() < 0 or counts.sum() != len(corners):
+def _chart(
+    prim: Any, slots: np.ndarray, faces: np.ndarray
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Texture coordinates `st` and their corners; none if they don't fit."""
+    from pxr import UsdGeom
+
+    st = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
+    # Without its name another set would be a guess.
+    uv = np.asarray(st.Get() or (), float) if st and st.HasValue() else np.zeros(0)
+    if uv.ndim != 2 or uv.shape[1] != 2:
+        return None, None
+    each = st.GetInterpolation()
+    if each not in (UsdGeom.Tokens.faceVarying, UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
+        return None, None
+    corners = slots if each == UsdGeom.Tokens.faceVarying else faces
+    if st.IsIndexed():
+        index = np.asarray(st.GetIndices(), np.int64)
+        if corners.max() >= len(index):
+            return None, None
+        corners = index[corners]
+    if corners.min() < 0 or corners.max() >= len(uv):
+        return None, None
+    return uv, corners.astype(np.int32)
+
+
+def _triangles(counts: np.ndarray, corners: int) -> np.ndarray:
+    """Corners of polygons cut as fans."""
+    if counts.min() < 0 or counts.sum() != corners:
         return np.zeros((0, 3), np.int32)
     starts = np.cumsum(counts) - counts
     rows = [
-        np.stack([corners[s], corners[s + k], corners[s + k + 1]], axis=1)
+        np.stack([s, s + k, s + k + 1], axis=1)
         for n in np.unique(counts)
         for s in (starts[counts == n],)
         for k in range(1, n - 1)

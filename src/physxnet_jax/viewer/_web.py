@@ -21,8 +21,8 @@ from ..dressing import METHODS
 from ..errors import FormatError, PhysXNetError
 from ..files import whole_file
 from ..garment import FABRICS, TEMPLATES
-from ..io import EXTENSIONS, list_weights, write_clip
-from ..motion import CLIPS
+from ..io import EXTENSIONS, GARMENT_FORMATS, list_weights, write_clip
+from ..motion import CLIPS, GltfFile
 from ..simulation import ACCURACY
 from ._job import Choice, Shown, carry_out, check_choice
 from ._maps import magnified
@@ -148,8 +148,11 @@ class Viewer:
         # Only the last part, in plain characters: a name from the net is no path.
         name = re.sub(r"[^\w.-]", "_", pathlib.PurePosixPath(name.replace("\\", "/")).name)
         suffix = pathlib.Path(name).suffix.lower()
-        if suffix not in (*_MOTIONS, ".obj", ".asf") or name.startswith("."):
-            raise FormatError(f"{name}: not a motion ({', '.join(_MOTIONS)}) nor a garment (.obj).")
+        if suffix not in (*_MOTIONS, *GARMENT_FORMATS, ".asf") or name.startswith("."):
+            raise FormatError(
+                f"{name}: not a motion ({', '.join(_MOTIONS)}) nor a garment"
+                f" ({', '.join(GARMENT_FORMATS)})."
+            )
         path = pathlib.Path(self._folder.name) / name
         with whole_file(path) as part:
             part.write_bytes(content)
@@ -157,8 +160,12 @@ class Viewer:
             # The AMC that asked for it may be there already.
             self.ask()
             return
+        # A glTF in which nothing moves is a garment.
+        moves = suffix in _MOTIONS
+        if moves and suffix in GARMENT_FORMATS:
+            moves = bool(GltfFile(path).document.animations)
         self._files[name] = path
-        if suffix == ".obj":
+        if not moves:
             with self._lock, self._clothes:
                 self._add_garment(name, True)
         else:

@@ -1,0 +1,97 @@
+"""Meshes of a file, moving or still, before they are brought to metres."""
+
+import dataclasses
+import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..errors import FormatError
+
+
+@dataclasses.dataclass(frozen=True)
+class Moving:
+    """A part of a file: a mesh that moves, in the file's own unit and axes.
+
+    Attributes:
+        name: Its name there.
+        positions: Shape [frames, vertices, 3].
+        faces: Triangles.
+        uv: Texture coordinates; or None.
+        uv_faces: Corners in ``uv``; or None.
+        bind: The pose in which a skin was bound, shape [vertices, 3]; or None.
+    """
+
+    name: str
+    positions: Float[np.ndarray, "frames vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    uv: Float[np.ndarray, "uvs 2"] | None = None
+    uv_faces: Int[np.ndarray, "faces 3"] | None = None
+    bind: Float[np.ndarray, "vertices 3"] | None = None
+
+
+def named(
+    path: pathlib.Path, parts: Sequence[Moving], name: str | None, advice: str
+) -> Sequence[Moving]:
+    """The meshes of this name, all without one.
+
+    Raises:
+        FormatError: None is called that.
+    """
+    if name is None:
+        return parts
+    chosen = [p for p in parts if p.name == name]
+    if not chosen:
+        names = ", ".join(sorted({p.name for p in parts}))[:300]
+        raise FormatError(f"{path}: no mesh '{name}'; there are {names}. {advice}.")
+    return chosen
+
+
+def joined(parts: Sequence[Moving]) -> Moving:
+    """Several meshes as one."""
+    if len(parts) == 1:
+        return parts[0]
+    first = np.cumsum([0, *(p.positions.shape[1] for p in parts)])
+    faces = [p.faces + n for p, n in zip(parts, first[:-1], strict=True)]
+    binds = [p.bind for p in parts]
+    uv = uv_faces = None
+    if all(p.uv is not None and p.uv_faces is not None for p in parts):
+        starts = np.cumsum([0, *(len(p.uv) for p in parts if p.uv is not None)])
+        uv = np.concatenate([p.uv for p in parts if p.uv is not None])
+        uv_faces = np.concatenate(
+            [p.uv_faces + n for p, n in zip(parts, starts) if p.uv_faces is not None]
+        )
+    return Moving(
+        "body",
+        np.concatenate([p.positions for p in parts], axis=1),
+        np.concatenate(faces),
+        uv,
+        uv_faces,
+        None
+        if any(b is None for b in binds)
+        else np.concatenate([b for b in binds if b is not None]),
+    )
+
+
+def welded(part: Moving) -> Moving:
+    """Vertices that were doubled at texture seams become one again."""
+    place = part.positions[0] if part.bind is None else part.bind
+    both = np.concatenate([place, part.positions[-1]], axis=1)
+    keys = np.round(both / max(float(np.ptp(place, axis=0).max()), 1e-9) * 1e6)
+    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    # In the file's order, so that a mesh without seams stays as it was.
+    order = np.argsort(first)
+    first, rank = first[order], np.argsort(order)
+    faces = rank[index.reshape(-1)][part.faces].astype(np.int32)
+    whole = (
+        (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    )
+    return Moving(
+        part.name,
+        part.positions[:, first],
+        faces[whole],
+        part.uv,
+        None if part.uv_faces is None else part.uv_faces[whole],
+        None if part.bind is None else part.bind[first],
+    )

@@ -1,0 +1,160 @@
+"""A garment is the same one whichever format it comes in."""
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import KDTree
+
+from physxnet_jax.errors import FormatError, PhysXNetError
+from physxnet_jax.garment import template
+from physxnet_jax.io import (
+    GARMENT_FORMATS,
+    AnimatedMesh,
+    inspect_garment,
+    load_garment,
+    read_mesh,
+    write_clip,
+    write_obj,
+)
+
+
+@pytest.fixture(scope="module")
+def trousers():
+    """The template's mesh, and a chart whose seam doubles vertices in glTF and PLY."""
+    mesh = template("bottom").mesh
+    v, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    around = np.arctan2(v[:, 0], v[:, 2]) / (2 * np.pi) + 0.5
+    u = around[faces]
+    u = np.where((np.ptp(u, axis=1, keepdims=True) > 0.5) & (u < 0.5), u + 1.0, u)
+    corners = np.stack([u, v[faces][..., 1]], axis=2).reshape(-1, 2)
+    uv, index = np.unique(np.round(corners, 5), axis=0, return_inverse=True)
+    return v, faces, uv, index.reshape(-1, 3).astype(np.int32)
+
+
+def saved(folder, suffix, trousers):
+    v, faces, uv, uv_faces = trousers
+    path = folder / f"trousers{suffix}"
+    if suffix == ".obj":
+        write_obj(path, *trousers)
+    elif suffix in (".ply", ".stl"):
+        # A program that writes PLY with a chart doubles what lies on its seam.
+        pairs, index = np.unique(
+            np.stack([faces, uv_faces], axis=2).reshape(-1, 2), axis=0, return_inverse=True
+        )
+        chart = trimesh.visual.TextureVisuals(uv=uv[pairs[:, 1]])
+        mesh = trimesh.Trimesh(v[pairs[:, 0]], index.reshape(-1, 3), process=False, visual=chart)
+        mesh.export(path)
+    else:
+        write_clip(path, [AnimatedMesh("trousers", v[None], faces, uv, uv_faces)], 30.0)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [s for s in GARMENT_FORMATS if s not in (".gltf", ".usd")])
+def test_every_format_holds_the_same_mesh(suffix, trousers, tmp_path):
+    v, faces, uv, uv_faces = trousers
+    mesh = read_mesh(saved(tmp_path, suffix, trousers))
+    assert mesh.vertices.shape == v.shape, "what lies on a seam is one vertex"
+    np.testing.assert_allclose(mesh.vertices[mesh.faces], v[faces], atol=1e-6)
+    assert mesh.polygons == len(faces)
+    if suffix == ".stl":
+        assert mesh.uv is None
+    else:
+        np.testing.assert_allclose(mesh.uv[mesh.uv_faces], uv[uv_faces], atol=1e-5)
+
+
+def test_worn_it_is_the_garment_that_the_obj_is(trousers, tmp_path):
+    wanted, _ = load_garment(saved(tmp_path, ".obj", trousers))
+    garment, report = load_garment(saved(tmp_path, ".glb", trousers))
+    assert (report.unit, report.up, report.template) == ("m", "Y", "bottom")
+    off, order = KDTree(wanted.mesh.vertices).query(garment.mesh.vertices)
+    assert off.max() < 1e-5 and len(set(order)) == len(order)
+    np.testing.assert_array_equal(garment.pinned, np.asarray(wanted.pinned)[order])
+    np.testing.assert_allclose(garment.skin, np.asarray(wanted.skin)[order], atol=1e-3)
+    assert garment.name == "trousers"
+
+
+def test_a_mesh_without_seams_keeps_its_order(trousers, tmp_path):
+    v, faces, _, _ = trousers
+    trimesh.Trimesh(v, faces, process=False).export(tmp_path / "a.ply")
+    write_clip(tmp_path / "a.usda", [AnimatedMesh("a", v[None], faces)], 30.0)
+    for name in ("a.ply", "a.usda"):
+        mesh = read_mesh(tmp_path / name)
+        np.testing.assert_allclose(mesh.vertices, v, atol=1e-6)
+        np.testing.assert_array_equal(mesh.faces, faces)
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".usda"])
+def test_one_of_several_meshes_is_taken_by_its_name(suffix, trousers, tmp_path):
+    v, faces, _, _ = trousers
+    person = AnimatedMesh("person", v[None] + np.float32(0.3), faces[:40])
+    path = tmp_path / f"both{suffix}"
+    write_clip(path, [person, AnimatedMesh("trousers", v[None], faces)], 30.0)
+    both, one = read_mesh(path), read_mesh(f"{path}#trousers")
+    assert both.parts == ("person", "trousers") and one.parts == ("trousers",)
+    assert len(both.faces) == len(faces) + 40 and len(one.faces) == len(faces)
+    assert load_garment(f"{path}#trousers=bottom")[0].name == "both_trousers"
+    with pytest.raises(FormatError, match="no mesh 'hat'; there are person, trousers"):
+        read_mesh(f"{path}#hat")
+    if suffix == ".usda":
+        return
+    found = inspect_garment(path)
+    assert any("2 meshes (person, trousers)" in n and "both" in n for n in found.notes)
+    assert not any("meshes" in n for n in inspect_garment(f"{path}#trousers").notes)
+
+
+def test_a_rigged_mesh_is_read_as_it_was_bound(tmp_path):
+    """Where its node stands now, and how its joints have been turned, says nothing of it."""
+    text = """#usda 1.0
+(
+    metersPerUnit = 0.01
+    upAxis = "Z"
+)
+def SkelRoot "person"
+{
+    def Mesh "shirt" (prepend apiSchemas = ["SkelBindingAPI"])
+    {
+        int[] faceVertexCounts = [4, 3]
+        int[] faceVertexIndices = [0, 1, 2, 3, 1, 4, 2]
+        point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1), (2, 0, 0)]
+        texCoord2f[] primvars:st = [(0, 0), (1, 0)] (interpolation = "faceVarying")
+        int[] primvars:st:indices = [0, 1, 1, 0, 1, 0, 1]
+        matrix4d primvars:skel:geomBindTransform = BIND
+        double3 xformOp:translate = (900, 0, 0)
+        uniform token[] xformOpOrder = ["xformOp:translate"]
+    }
+}
+"""
+    bind = "((10, 0, 0, 0), (0, 10, 0, 0), (0, 0, 10, 0), (0, 0, 5, 1))"
+    (tmp_path / "a.usda").write_text(text.replace("BIND", bind))
+    mesh = read_mesh(tmp_path / "a.usda")
+    wanted = np.array([[0, 0, 5], [10, 0, 5], [10, 0, 15], [0, 0, 15], [20, 0, 5]]) * 0.01
+    np.testing.assert_allclose(mesh.vertices, wanted, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, [[1, 4, 2], [0, 1, 2], [0, 2, 3]])
+    np.testing.assert_array_equal(mesh.uv[mesh.uv_faces][..., 0], [[1, 0, 1], [0, 1, 1], [0, 1, 0]])
+
+
+def test_what_is_no_garment_is_refused(trousers, tmp_path):
+    for name, blob, told in (
+        ("a.fbx", b"Kaydara FBX Binary", "'.fbx'"),
+        ("a.ply", b"ply\nformat binary_little_endian 1.0\n", "not a mesh"),
+        ("b.ply", saved(tmp_path, ".ply", trousers).read_bytes()[:-9], "not a mesh"),
+        ("a.stl", b"\0" * 84, "a mesh needs both"),
+        ("a.usda", b"#usda 1.0\n", "no mesh in it"),
+    ):
+        (tmp_path / name).write_bytes(blob)
+        with pytest.raises(FormatError, match=told):
+            read_mesh(tmp_path / name)
+    with pytest.raises(FormatError, match="no such file"):
+        read_mesh(tmp_path / "none.glb")
+    path = saved(tmp_path, ".obj", trousers)
+    with pytest.raises(FormatError, match="holds one mesh"):
+        read_mesh(f"{path}#sleeves")
+    with pytest.raises(PhysXNetError, match="or files"):
+        load_garment("hat")
+
+
+def test_a_flat_shaded_stl_becomes_one_sheet(trousers, tmp_path):
+    """Every triangle of an STL has corners of its own."""
+    v, faces, _, _ = trousers
+    trimesh.Trimesh(v, faces, process=False).export(tmp_path / "a.stl")
+    assert inspect_garment(tmp_path / "a.stl").health.components == 1
