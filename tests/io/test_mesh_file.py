@@ -149,7 +149,7 @@ def test_what_is_no_garment_is_refused(trousers, tmp_path):
     path = saved(tmp_path, ".obj", trousers)
     with pytest.raises(FormatError, match="holds one mesh"):
         read_mesh(f"{path}#sleeves")
-    with pytest.raises(PhysXNetError, match="or files"):
+    with pytest.raises(PhysXNetError, match="or a file"):
         load_garment("hat")
 
 

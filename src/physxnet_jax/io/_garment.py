@@ -31,7 +31,7 @@ from ..geometry import (
     vertex_normals,
 )
 from ._clip import StillMesh
-from ._mesh_file import GARMENT_FORMATS, mesh_name, read_mesh
+from ._mesh_file import GARMENT_FORMATS, mesh_name, read_mesh, split_part
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
 NEAREST = 0.003
@@ -107,9 +107,10 @@ def load_garment(
         )
         return g, report
     path = pathlib.Path(path)
-    if not path.suffix:
+    if split_part(path)[0].suffix.lower() not in GARMENT_FORMATS:
         raise MeshError(
-            f"{path}: garments are {', '.join(TEMPLATES)} or files ({', '.join(GARMENT_FORMATS)})."
+            f"{path}: a garment is one of {', '.join(TEMPLATES)} (which '=top' behind a file says"
+            f") or a file of triangles or quads: {', '.join(GARMENT_FORMATS)}."
         )
     raw = read_mesh(path)
     rest = body.rest_vertices(body.default_shape())

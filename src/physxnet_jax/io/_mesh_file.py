@@ -21,7 +21,7 @@ _FARTHEST = 1e18
 
 def mesh_name(path: str | pathlib.Path) -> str:
     """What a mesh of a file is called: ``coat``, or ``coat_sleeves`` for one of several."""
-    file, part = _split(path)
+    file, part = split_part(path)
     return file.stem if part is None else f"{file.stem}_{part}"
 
 
@@ -41,7 +41,7 @@ def read_mesh(path: str | pathlib.Path) -> StillMesh:
         MotionError: A damaged glTF.
         MissingDependencyError: Without the library that reads it.
     """
-    path, part = _split(path)
+    path, part = split_part(path)
     suffix = path.suffix.lower()
     if suffix not in GARMENT_FORMATS:
         raise FormatError(
@@ -68,7 +68,7 @@ def read_mesh(path: str | pathlib.Path) -> StillMesh:
     return _still(path, named(path, parts, part, "Say another after the #"))
 
 
-def _split(path: str | pathlib.Path) -> tuple[pathlib.Path, str | None]:
+def split_part(path: str | pathlib.Path) -> tuple[pathlib.Path, str | None]:
     """The file and, after a ``#``, the mesh of it that is meant."""
     file, _, part = str(path).rpartition("#")
     if file and pathlib.Path(file).suffix.lower() in GARMENT_FORMATS:
