@@ -12,13 +12,30 @@ import jax  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-# Many tests compile the same programs, in several processes: once is enough.
-_CACHE = pathlib.Path(__file__).parents[1] / ".pytest_cache" / "xla"
+from physxnet_jax._environment import programs_folder  # noqa: E402
+
+# Many tests compile the same programs, in several processes, and every run does again:
+# once is enough on a machine.
+_CACHE = programs_folder("tests")
+_MOST_BYTES = 1e9
 jax.config.update("jax_compilation_cache_dir", str(_CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 # For what tests start as processes of their own.
 os.environ["JAX_COMPILATION_CACHE_DIR"] = str(_CACHE)
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+
+
+def pytest_configure(config):
+    """Drops the oldest programs, in one process."""
+    if hasattr(config, "workerinput") or not _CACHE.is_dir():
+        return
+    told = {p: p.stat() for p in _CACHE.iterdir()}
+    size = sum(s.st_size for s in told.values())
+    for path in sorted(told, key=lambda p: told[p].st_mtime):
+        if size < _MOST_BYTES:
+            break
+        path.unlink(missing_ok=True)
+        size -= told[path].st_size
 
 
 @pytest.fixture(autouse=True, scope="module")

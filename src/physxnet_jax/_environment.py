@@ -49,6 +49,15 @@ def cache_folder() -> pathlib.Path:
     return pathlib.Path(home) / "physxnet_jax"
 
 
+def programs_folder(what: str = "programs") -> pathlib.Path:
+    """Where compiled programs are kept, for this kind of processor alone.
+
+    A home may be shared by machines of which one can't run what another has compiled.
+    """
+    machine = f"{platform.machine()}-{hashlib.sha256(_processor().encode()).hexdigest()[:8]}"
+    return cache_folder() / what / machine
+
+
 def keeps_programs(words: Sequence[str]) -> bool:
     """Whether a process of these words is a command that should keep its programs.
 
@@ -63,15 +72,13 @@ def keeps_programs(words: Sequence[str]) -> bool:
 def keep_programs(environment: MutableMapping[str, str] | None = None) -> None:
     """Lets JAX keep compiled programs for the next process; before jax is imported.
 
-    What is already set stays as it is. Each kind of processor has its own folder: a
-    home may be shared by machines of which one can't run what another has compiled.
+    What is already set stays as it is.
 
     Args:
         environment: Variables to set; the process's own by default.
     """
     env = os.environ if environment is None else environment
-    machine = f"{platform.machine()}-{hashlib.sha256(_processor().encode()).hexdigest()[:8]}"
-    env.setdefault("JAX_COMPILATION_CACHE_DIR", str(cache_folder() / "programs" / machine))
+    env.setdefault("JAX_COMPILATION_CACHE_DIR", str(programs_folder()))
     # The small ones as well: there are a hundred, and together they take seconds.
     env.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     # Loading from the cache, XLA takes its own hints for missing instructions and says so

@@ -102,6 +102,35 @@ def test_a_small_bvh_is_read_exactly(tmp_path):
     np.testing.assert_allclose(clip.positions()[1, 1], [0, 1, -1], atol=1e-12)
 
 
+def test_of_several_skeletons_the_largest_is_read(tmp_path):
+    """A prop before the person, a camera after: neither moves him."""
+    head, frames = BVH.split("MOTION")
+    prop = head.split("JOINT")[0].partition("\n")[2].replace("Hips", "Prop") + "}\n"
+    other = prop.replace("Prop", "Hips")
+    rows = frames.strip().splitlines()
+    rows[2:] = [f"{'7 ' * 6}{row} {'8 ' * 6}" for row in rows[2:]]
+    path = tmp_path / "a.bvh"
+    path.write_text(
+        "HIERARCHY\n" + prop + head.partition("\n")[2] + other + "MOTION\n" + "\n".join(rows)
+    )
+    clip = read_bvh(path)
+    path.write_text(BVH)
+    alone = read_bvh(path)
+    assert clip.names == alone.names and clip.parents == alone.parents
+    for a, b in ((clip.positions(), alone.positions()), (clip.rotations, alone.rotations)):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_name_that_comes_again_gets_a_number(tmp_path):
+    knee = BVH[BVH.index("  JOINT Knee") : BVH.index("}\nMOTION")]
+    text = BVH.replace(knee, knee.replace("Knee", "Knee_2") + 2 * knee)
+    path = tmp_path / "a.bvh"
+    path.write_text(
+        "".join(f"{x} 1 2 3 4 5 6\n" if x[0] == "0" else f"{x}\n" for x in text.split("\n") if x)
+    )
+    assert read_bvh(path).names == ("Hips", "Knee_2", "Knee", "Knee_3")
+
+
 @pytest.mark.parametrize(
     ("change", "line", "says"),
     [
@@ -127,6 +156,8 @@ def test_a_small_bvh_is_read_exactly(tmp_path):
         (lambda s: s.replace("Frame Time: 0.0083333", "Frame Time: 0"), 18, "positive"),
         (lambda s: s.replace("    End Site", "    }}\n    End Site"), None, "'}"),
         (lambda s: s.replace("OFFSET 0 -1 0", "OFFSET 0 -1", 1), 8, "3"),
+        (lambda s: s.replace("JOINT Knee", "ROOT Knee"), 6, "inside a joint"),
+        (lambda s: s.replace("ROOT Hips", "JOINT Hips"), 2, "outside any joint"),
     ],
 )
 def test_broken_bvh_files_are_refused_naming_file_line_and_fix(tmp_path, change, line, says):

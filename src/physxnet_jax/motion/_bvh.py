@@ -1,5 +1,6 @@
 """Reader of BVH files: any hierarchy, any channel order."""
 
+import collections
 import pathlib
 
 import numpy as np
@@ -16,6 +17,9 @@ _MAX_DEPTH = 200
 
 def read_bvh(path: str | pathlib.Path) -> SourceClip:
     """A BVH file as it is, before retargeting.
+
+    Of several skeletons in a file the one of most joints is read, the first of such. A name
+    that comes again in a skeleton gets a number: ``Hand``, ``Hand_2``.
 
     Args:
         path: The file.
@@ -36,6 +40,9 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
     joints, motion_line = _read_hierarchy(path, lines)
     names, parents, offsets, channels = joints
     values, fps = _read_motion(path, lines, motion_line, sum(map(len, channels)))
+    names, parents, offsets, channels, values = _largest_tree(
+        names, parents, offsets, channels, values
+    )
     if len(values) * len(names) > MAX_JOINT_FRAMES:
         raise MotionError.at(
             path,
@@ -77,12 +84,37 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
     )
 
 
+def _largest_tree(
+    names: list[str],
+    parents: list[int],
+    offsets: np.ndarray,
+    channels: list[list[str]],
+    values: np.ndarray,
+) -> tuple[list[str], list[int], np.ndarray, list[list[str]], np.ndarray]:
+    root = np.arange(len(names))
+    for j, parent in enumerate(parents):
+        if parent >= 0:
+            root[j] = root[parent]
+    keep = np.flatnonzero(root == np.bincount(root).argmax())
+    owner = np.repeat(np.arange(len(names)), [len(c) for c in channels])
+    # A skeleton is written in one piece.
+    parents = [parents[j] - int(keep[0]) if parents[j] >= 0 else -1 for j in keep]
+    return (
+        [names[j] for j in keep],
+        parents,
+        offsets[keep],
+        [channels[j] for j in keep],
+        values[:, np.isin(owner, keep)],
+    )
+
+
 def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
     names: list[str] = []
     parents: list[int] = []
     offsets: list[list[float]] = []
     channels: list[list[str]] = []
     stack: list[int] = []
+    taken: collections.Counter[str] = collections.Counter()
     pending = end_site = False
     if lines[0].strip().upper() != "HIERARCHY":
         raise MotionError.at(
@@ -97,17 +129,22 @@ def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
             continue
         key = words[0]
         if key in ("ROOT", "JOINT"):
-            if key == "ROOT" and names:
-                raise MotionError.at(path, n, "a second ROOT", "Keep one skeleton a file")
-            if key == "JOINT" and not stack:
-                raise MotionError.at(path, n, "a JOINT outside any joint", "Check braces")
+            if (key == "JOINT") != bool(stack):
+                where = "outside any joint" if key == "JOINT" else "inside a joint"
+                raise MotionError.at(path, n, f"a {key} {where}", "Check braces")
             name = " ".join(words[1:]) or f"joint{len(names)}"
             # Some exporters prefix names with a namespace.
             name = name.split(":")[-1]
-            if name in names:
-                raise MotionError.at(path, n, f"a second joint '{name}'", "Rename one")
+            if key == "ROOT":
+                taken = collections.Counter()
+            taken[name] += 1
+            if taken[name] > 1:
+                while f"{name}_{taken[name]}" in taken:
+                    taken[name] += 1
+                name = f"{name}_{taken[name]}"
+                taken[name] = 1
             names.append(name)
-            parents.append(stack[-1] if stack else -1)
+            parents.append(stack[-1] if key == "JOINT" else -1)
             offsets.append([])
             channels.append([])
             pending = True
