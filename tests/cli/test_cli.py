@@ -97,7 +97,7 @@ def test_dress_writes_and_reports(tmp_path, capsys, method):
     ("words", "says"),
     [
         (["dress", "wlak"], "built-in clip"),
-        (["dress", "walk", "--wear", "hat"], "OBJ files"),
+        (["dress", "walk", "--wear", "hat"], "a file of triangles"),
         (["dress", "walk", "-o", "a.abc"], "usdc"),
         (["dress", "walk", "--preview", "a.avi"], "preview"),
         (["dress", "walk", "--shape", "tall=1"], "height_up"),

@@ -11,7 +11,10 @@ from physxnet_jax.cli import main
 from physxnet_jax.dressing import dress
 from physxnet_jax.errors import FormatError, MeshError
 from physxnet_jax.garment import template
+from physxnet_jax.geometry import make_mesh
 from physxnet_jax.io import fit_garment, inspect_garment, load_garment, read_obj, write_obj
+from physxnet_jax.io._drape import drape
+from physxnet_jax.io._garment import carried
 from physxnet_jax.io._inspect import _like
 
 
@@ -207,3 +210,51 @@ def test_however_it_lies_and_faces_it_is_put_where_the_template_is(name):
         placed, told, off = _like(100.0 * np.stack(axes, axis=1) + 40.0, garment, skin)
         assert np.abs(placed - there).max() < 1e-6, f"{how}: {told}"
         assert how[:4] in told and ("turned" in told) == ("turned" in how) and off < 0.2
+
+
+def test_what_hangs_in_the_air_is_let_down(tmp_path, capsys):
+    """A sleeveless top with a wide neck, placed too high, rests on the shoulders in the end."""
+    g = template("top")
+    v, faces = np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces)
+    neck = (np.abs(v[:, 0]) < 0.1) & (v[:, 1] > v[:, 1].max() - 0.12)
+    gone = neck | (np.abs(v[:, 0]) > 0.19)
+    faces = faces[~gone[faces].any(axis=1)]
+    used, faces = np.unique(faces, return_inverse=True)
+    v, faces = v[used], faces.reshape(-1, 3)
+    path = saved(tmp_path, "high.obj", v + [0.0, 0.04, 0.0], faces)
+    found = inspect_garment(path)
+    assert found.hangs > 0.02 and any("holds it up" in p for p in found.problems)
+    assert (
+        "--drape" in found.command
+        and inspect_garment(saved(tmp_path, "a.obj", v, faces)).hangs < 0.015
+    )
+    out = tmp_path / "low.obj"
+    assert main(["fit", str(path), "--drape", "--edge-length", "20", "-o", str(out)]) == 0
+    assert "let it down" in capsys.readouterr().out
+    after = inspect_garment(out)
+    assert after.hangs < 0.01 and after.inside < 0.02
+    before, lain = (load_garment(p)[0].mesh for p in (path, out))
+    a, b = faces[:, 0], faces[:, 1]
+    lengths = [
+        np.linalg.norm(np.asarray(m.vertices)[a] - np.asarray(m.vertices)[b], axis=1)
+        for m in (before, lain)
+    ]
+    assert np.median(np.abs(lengths[1] / lengths[0] - 1)) < 0.03
+
+
+def test_what_falls_off_is_refused(tmp_path):
+    """A ring about the chest, too wide to rest on anything."""
+    around = np.linspace(0.0, 2 * np.pi, 40, endpoint=False)
+    ring = np.stack([0.45 * np.sin(around), 0 * around, 0.45 * np.cos(around)], axis=1)
+    v = np.concatenate([ring + [0.0, h, 0.0] for h in (0.2, 0.25, 0.3)])
+    n = np.arange(40)
+    quads = [
+        (k * 40 + n, k * 40 + (n + 1) % 40, (k + 1) * 40 + (n + 1) % 40, (k + 1) * 40 + n)
+        for k in (0, 1)
+    ]
+    faces = np.concatenate(
+        [np.stack(c, axis=1) for a, b, c_, d in quads for c in ((a, b, c_), (a, c_, d))]
+    )
+    hoop = carried(make_mesh(v, faces), "top", "hoop", load_body())
+    with pytest.raises(MeshError, match="hoop: falls off"):
+        drape(hoop)

@@ -92,6 +92,7 @@ class Fit:
     Examples:
       physxnet fit my_shirt.obj -o my_shirt_fitted.obj
       physxnet fit scan.obj --like dress --decimate 12 -o scan_fitted.obj
+      physxnet fit tank_top.glb --drape -o tank_top_fitted.obj
     """
 
     file: tyro.conf.Positional[pathlib.Path]
@@ -104,6 +105,8 @@ class Fit:
     """Split edges that are longer than this [mm]."""
     decimate: float | None = None
     """Before that, make it coarser: edges of about this length [mm]; drops texture coordinates."""
+    drape: bool = False
+    """At last let it down onto the body by its weight: for straps that hang in the air."""
     json: bool = False
     """Print JSON for machines instead of tables."""
     quiet: bool = False

@@ -14,7 +14,7 @@ from ..errors import MeshError
 from ..garment import template
 from ..io import Inspection, fit_garment, inspect_garment, write_obj
 from ._commands import Fit, Inspect, Rest
-from ._progress import print_json
+from ._progress import print_json, progress_bars
 
 
 def inspect(command: Inspect, console: Console) -> int:
@@ -37,9 +37,16 @@ def fit(command: Fit, console: Console) -> int:
         None if mm is None else 1e-3 * mm for mm in (command.edge_length, command.decimate)
     )
     quiet = Console(quiet=True) if command.json else console
-    with quiet.status("fitting"):
+    with progress_bars(quiet) as bars:
+        bars("fitting", 0, 1)
         done, result = fit_garment(
-            command.file, command.out, like=command.like, edge_length=longest, coarser=coarser
+            command.file,
+            command.out,
+            like=command.like,
+            edge_length=longest,
+            coarser=coarser,
+            draped=command.drape,
+            progress=lambda k, n: bars("letting it down", k, n),
         )
     if command.json:
         print_json({"done": done, "result": _plain(result), "files": [command.out]})
@@ -89,6 +96,7 @@ def _show(found: Inspection, console: Console) -> None:
             ("openings", f"{len(h.openings)}: {around} m round" if h.openings else "none"),
             ("edges", f"{1e3 * h.median_edge:.1f} mm, up to {1e3 * h.longest_edge:.0f} mm"),
             ("above the skin", f"{1e3 * found.distance:.0f} mm, up to {1e3 * found.farthest:.0f}"),
+            ("its top", f"{1e3 * found.hangs:.0f} mm off the skin"),
             ("inside the body", f"{100 * found.inside:.1f} %"),
             ("facing outwards", f"{100 * found.outward:.0f} %"),
             ("dressed by", found.template or "-"),

@@ -23,6 +23,7 @@ from ..garment import (
     template,
 )
 from ..geometry import (
+    TriMesh,
     boundary_loops,
     closest_among,
     make_mesh,
@@ -30,7 +31,6 @@ from ..geometry import (
     nearby_faces,
     vertex_normals,
 )
-from ._clip import StillMesh
 from ._mesh_file import GARMENT_FORMATS, mesh_name, read_mesh, split_part
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
@@ -113,36 +113,16 @@ def load_garment(
             f") or a file of triangles or quads: {', '.join(GARMENT_FORMATS)}."
         )
     raw = read_mesh(path)
-    rest = body.rest_vertices(body.default_shape())
     mesh = body.rest_mesh()
-    skin = np.asarray(mesh.vertices)
     v, unit, up = place_on_body(path, raw.vertices, body)
     distance, _ = clearance(mesh, v)
     moved, inside = lift_out(mesh, v, raw.faces, NEAREST)
-    near = nearby_faces(skin, np.asarray(mesh.faces), moved, neighbours=12)
-    points = jnp.asarray(moved.astype(np.float32))
-    hit = jax.jit(closest_among)(mesh, points, jnp.asarray(near))
-    refs = mesh.faces[hit.face]
-    foot = jnp.einsum("vk,vkc->vc", hit.weights, rest[refs])
-    weights = np.asarray(carried_weights(body.weights, refs, hit.weights))
-    weights = _smooth_far(weights, raw, np.sqrt(np.asarray(hit.squared_distance)))
     kind = guess_template(moved, raw.faces) if kind is None else kind
-    pinned = np.zeros(len(v), dtype=bool)
-    loops = boundary_loops(raw.faces)
-    if kind == "bottom" and loops:
-        pinned[max(loops, key=lambda x: moved[x, 1].mean())] = True
-    # No cloth holds what no face uses: it would fall out of the scene.
-    pinned[np.setdiff1d(np.arange(len(v)), raw.faces)] = True
-    garment = Garment(
+    garment = carried(
         make_mesh(moved, raw.faces, raw.uv, raw.uv_faces, name=str(path)),
-        jnp.asarray(pinned),
-        refs,
-        hit.weights,
-        points - foot,
-        jnp.asarray(weights.astype(np.float32)),
-        COTTON,
         kind,
         mesh_name(path),
+        body,
     )
     report = GarmentReport(
         unit,
@@ -155,6 +135,37 @@ def load_garment(
         kind,
     )
     return garment, report
+
+
+def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
+    """A mesh that lies on the body, carried by the closest skin."""
+    skin = body.rest_mesh()
+    rest = body.rest_vertices(body.default_shape())
+    v, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    near = nearby_faces(np.asarray(skin.vertices), np.asarray(skin.faces), v, neighbours=12)
+    points = jnp.asarray(v.astype(np.float32))
+    hit = jax.jit(closest_among)(skin, points, jnp.asarray(near))
+    refs = skin.faces[hit.face]
+    foot = jnp.einsum("vk,vkc->vc", hit.weights, rest[refs])
+    weights = np.asarray(carried_weights(body.weights, refs, hit.weights))
+    weights = _smooth_far(weights, faces, np.sqrt(np.asarray(hit.squared_distance)))
+    pinned = np.zeros(len(v), dtype=bool)
+    loops = boundary_loops(faces)
+    if kind == "bottom" and loops:
+        pinned[max(loops, key=lambda x: v[x, 1].mean())] = True
+    # No cloth holds what no face uses: it would fall out of the scene.
+    pinned[np.setdiff1d(np.arange(len(v)), faces)] = True
+    return Garment(
+        mesh,
+        jnp.asarray(pinned),
+        refs,
+        hit.weights,
+        points - foot,
+        jnp.asarray(weights.astype(np.float32)),
+        COTTON,
+        kind,
+        name,
+    )
 
 
 def place_on_body(
@@ -212,9 +223,9 @@ def guess_template(
     return "bottom" if len(low) >= 2 else "dress"
 
 
-def _smooth_far(weights: np.ndarray, raw: StillMesh, distance: np.ndarray) -> np.ndarray:
+def _smooth_far(weights: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Skinning weights averaged over the mesh where the skin is far away."""
-    average = smoothing_matrix(raw.faces, len(weights))
+    average = smoothing_matrix(faces, len(weights))
     share = np.clip((distance - 0.02) / 0.04, 0.0, 1.0)[:, None]
     for _ in range(60):
         weights = weights + share * (average @ weights - weights)

@@ -3,7 +3,9 @@
 import dataclasses
 import pathlib
 import shlex
+from collections.abc import Callable
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -26,12 +28,14 @@ from ..garment import (
 )
 from ..geometry import TriMesh, make_mesh
 from ..uv import bind, garment_map_rows, make_atlas
-from ._garment import NEAREST, load_garment, place_on_body
+from ._drape import drape
+from ._garment import NEAREST, carried, guess_template, load_garment, place_on_body
 from ._mesh_file import mesh_name, read_mesh
 from ._obj import write_obj
 
 # Shares and lengths beyond which a garment is worth a word [1], [m].
 _INSIDE, _LONG, _FINE, _MISSED = 0.02, 0.04, 0.003, 0.1
+_HANGS, _TOPMOST = 0.02, 0.1
 # Sizes within which meshes are alike, and what turning one has to gain [m].
 _UNLIKE, _TURNED = 0.1, 0.001
 # Rotations that make an axis of a file Y.
@@ -57,6 +61,8 @@ class Inspection:
         polygons: Faces before they were cut into triangles.
         distance: Median distance to the skin [m].
         farthest: Largest distance to the skin [m].
+        hangs: How far the highest tenth of it stays from the skin [m]: what rests on
+            shoulders or hips touches them there.
         inside: Share of vertices inside the body or within 3 mm of it.
         outward: Share of faces that look away from the body.
         template: The template that dresses it: by what it covers.
@@ -76,6 +82,7 @@ class Inspection:
     polygons: int
     distance: float
     farthest: float
+    hangs: float
     inside: float
     outward: float
     template: Template | None
@@ -120,13 +127,15 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         nan = float("nan")
         command = _command(path, options)
         return Inspection(
-            path, None, None, size, health, raw.polygons, nan, nan, nan, nan, None, {}, nan,
+            path, None, None, size, health, raw.polygons, nan, nan, nan, nan, nan, None, {}, nan,
             tuple(problems), (), command,
         )  # fmt: skip
     mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
     health = mesh_health(mesh)
     distance, _ = clearance(skin, np.asarray(v, np.float32))
     inside = float(np.mean(distance < NEAREST))
+    height = np.asarray(v)[:, 1]
+    hangs = float(distance[height >= height.max() - _TOPMOST * np.ptp(height)].min())
     corner = np.asarray(v)[raw.faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     _, away = clearance(skin, corner.mean(axis=1).astype(np.float32))
@@ -150,6 +159,11 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         )
     if inside > _INSIDE:
         problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
+    if hangs > _HANGS:
+        problems.append(
+            f"its top stays {1e3 * hangs:.0f} mm off the skin, where nothing holds it up."
+        )
+        options.append("--drape")
     if health.longest_edge > _LONG:
         problems.append(
             f"edges up to {1e3 * health.longest_edge:.0f} mm: too long to fold, and they cut"
@@ -175,7 +189,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         )
     return Inspection(
         path, unit, up, size, health, raw.polygons, float(np.median(np.abs(distance))),
-        float(distance.max()), inside, outward, garment.template, _apart(v), hit_rate,
+        float(distance.max()), hangs, inside, outward, garment.template, _apart(v), hit_rate,
         tuple(problems), tuple(notes), _command(path, options) if problems else None,
     )  # fmt: skip
 
@@ -187,7 +201,9 @@ def fit_garment(
     like: Template | None = None,
     edge_length: float | None = None,
     coarser: float | None = None,
+    draped: bool = False,
     body: Body | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[str], Inspection]:
     """Writes a garment that can be worn: on the body, clean, oriented and out of the skin.
 
@@ -198,7 +214,9 @@ def fit_garment(
         edge_length: Split edges longer than this [m].
         coarser: Before that, decimate to about this edge length [m]; texture coordinates
             are lost.
+        draped: At last let it down onto the body, by `drape`.
         body: The body; the built-in one by default.
+        progress: Called by `drape`.
 
     Returns:
         What was done, a sentence each, and how the result looks.
@@ -206,7 +224,7 @@ def fit_garment(
     Raises:
         FormatError: A file that can't be read.
         MeshError: No unit and axis puts it on the body, and ``like`` isn't given; ``out``
-            is the file itself.
+            is the file itself; it falls off the body.
         MissingDependencyError: Decimation without fast-simplification.
     """
     path, out = pathlib.Path(path), pathlib.Path(out)
@@ -256,6 +274,13 @@ def fit_garment(
     )
     if low.any():
         done.append(f"lifted {int(low.sum()):,} vertices out of the body or off it.")
+    if draped:
+        hung = mesh.replace(vertices=jnp.asarray(moved.astype(np.float32)))
+        kind = guess_template(moved, np.asarray(mesh.faces)) if like is None else like
+        lain = drape(carried(hung, kind, path.name, body), body=body, progress=progress)
+        far = np.linalg.norm(lain - moved, axis=1)
+        done.append(f"let it down: it moved by {1e3 * float(np.median(far)):.0f} mm.")
+        moved, _ = lift_out(skin, lain, np.asarray(mesh.faces), _LIFT * NEAREST, iterations=12)
     write_obj(
         out,
         moved,
