@@ -2,8 +2,9 @@
 
 Command: python experiments/ablations.py --data runs/ours --extra runs/extra --slow runs/slow
          --other runs/blender
-Cost:    5 to 10 minutes a variant on two cores beside other work (maps of 256 x 256: not run);
-         goes on where it was stopped. Variants whose dataset isn't built are left out and said so.
+Cost:    5 to 10 minutes a variant on two cores beside other work (maps of 256 x 256: half an
+         hour); goes on where it was stopped. Variants whose dataset isn't built are left out
+         and said so.
 Result:  experiments/results/ablations.json and .md: RMSE over vertices of the twelve test
          actions for each template, beside skinning. The seconds of a training step are in
          the JSON alone: a machine that does other things beside makes them incomparable.
@@ -80,7 +81,7 @@ VARIANTS: dict[str, tuple[TrainConfig, tuple[str, ...]]] = {
     "and slower actions": (BASE, ("data", "slow")),
     "other engine": (BASE, ("other",)),
 }
-# Left out unless asked for by --only: hours on two cores.
+# Left out unless asked for by --only: half an hour on two cores.
 LONG = ("256 x 256",)
 
 
