@@ -228,9 +228,12 @@ def test_what_hangs_in_the_air_is_let_down(tmp_path, capsys):
         "--drape" in found.command
         and inspect_garment(saved(tmp_path, "a.obj", v, faces)).hangs < 0.015
     )
+    worn = dress("walk", [path, "bottom"], method="lbs", frames=2)
+    assert len(worn.notes) == 1 and "off the skin" in worn.notes[0] and path.name in worn.notes[0]
     out = tmp_path / "low.obj"
     assert main(["fit", str(path), "--drape", "--edge-length", "20", "-o", str(out)]) == 0
     assert "let it down" in capsys.readouterr().out
+    assert not dress("walk", [out], method="lbs", frames=2).notes
     after = inspect_garment(out)
     assert after.hangs < 0.01 and after.inside < 0.02
     before, lain = (load_garment(p)[0].mesh for p in (path, out))

@@ -283,7 +283,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     for table in closing_table(clip):
         console.print(table)
     for note in clip.notes:
-        console.print(note)
+        console.print(note, highlight=False, markup=False)
     if picked is not None:
         console.print(picked.told, highlight=False)
     for path in written:

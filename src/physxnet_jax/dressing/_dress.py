@@ -157,9 +157,16 @@ def dress(
     with watch("garments"):
         # A character's clothes are modelled on the body as it is, and carried over.
         on = body if person is None else load_body()
-        garments = with_names(
-            [g if isinstance(g, Garment) else load_garment(g, body=on)[0] for g in wear]
-        )
+        notes, garments = [] if person is None else [*person.notes], []
+        for worn in wear:
+            if isinstance(worn, Garment):
+                garments.append(worn)
+                continue
+            garment, found = load_garment(worn, body=on)
+            garments.append(garment)
+            if found.warning is not None:
+                notes.append(found.warning)
+        garments = with_names(garments)
         if person is not None:
             garments = [on_character(g, person) for g in garments]
         else:
@@ -220,7 +227,7 @@ def dress(
         inside if inside_raw is None else inside_raw,
         inside,
         method,
-        () if person is None else person.notes,
+        tuple(notes),
     )
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import shlex
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +29,7 @@ from ..geometry import (
     closest_among,
     make_mesh,
     manifold_report,
+    mesh_edges,
     nearby_faces,
     vertex_normals,
 )
@@ -35,6 +37,9 @@ from ._mesh_file import GARMENT_FORMATS, mesh_name, read_mesh, split_part
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
 NEAREST = 0.003
+# What hangs farther off the skin with its highest tenth, or has longer edges, looks wrong [m].
+HANGS, LONG = 0.02, 0.04
+_TOPMOST = 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,6 +47,7 @@ class GarmentReport:
     """What was found out about a garment file.
 
     Attributes:
+        path: The file, or the template's name.
         unit: Its unit.
         up: Its up axis.
         vertices: Number of vertices.
@@ -51,8 +57,11 @@ class GarmentReport:
             were moved out.
         distance: Median distance to the skin [m].
         template: The template it is dressed by.
+        hangs: How far its highest tenth stays from the skin [m].
+        longest_edge: Length of its longest edge [m].
     """
 
+    path: str
     unit: str
     up: str
     vertices: int
@@ -61,6 +70,21 @@ class GarmentReport:
     inside: float
     distance: float
     template: str
+    hangs: float
+    longest_edge: float
+
+    @property
+    def warning(self) -> str | None:
+        """What will look wrong when it is worn as it is, and what to do."""
+        found = []
+        if self.hangs > HANGS:
+            found.append(f"its top stays {1e3 * self.hangs:.0f} mm off the skin")
+        if self.longest_edge > LONG:
+            found.append(f"edges up to {1e3 * self.longest_edge:.0f} mm are too long to fold")
+        if not found:
+            return None
+        file = shlex.quote(self.path)
+        return f"{self.path}: {', '.join(found)}; `physxnet inspect {file}` says what mends it."
 
 
 def load_garment(
@@ -96,6 +120,7 @@ def load_garment(
     if str(path) in TEMPLATES:
         g = template(str(path))  # pyright: ignore[reportArgumentType]
         report = GarmentReport(
+            str(path),
             "m",
             "Y",
             g.num_vertices,
@@ -104,6 +129,8 @@ def load_garment(
             0.0,
             0.01,
             g.template,
+            0.0,
+            _longest_edge(np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces)),
         )
         return g, report
     path = pathlib.Path(path)
@@ -125,6 +152,7 @@ def load_garment(
         body,
     )
     report = GarmentReport(
+        str(path),
         unit,
         up,
         len(v),
@@ -133,8 +161,26 @@ def load_garment(
         float(inside.mean()),
         float(np.median(np.abs(distance))),
         kind,
+        hangs_off(v, distance),
+        _longest_edge(np.asarray(v), raw.faces),
     )
     return garment, report
+
+
+def hangs_off(
+    vertices: Float[np.ndarray, "vertices 3"], distance: Float[np.ndarray, " vertices"]
+) -> float:
+    """How far the highest tenth of a mesh stays from the skin [m].
+
+    What rests on shoulders or hips touches them there.
+    """
+    height = np.asarray(vertices)[:, 1]
+    return float(distance[height >= height.max() - _TOPMOST * np.ptp(height)].min())
+
+
+def _longest_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
+    ends = vertices[mesh_edges(faces).vertices]
+    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max(initial=0.0))
 
 
 def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:

@@ -29,13 +29,21 @@ from ..garment import (
 from ..geometry import TriMesh, make_mesh
 from ..uv import bind, garment_map_rows, make_atlas
 from ._drape import drape
-from ._garment import NEAREST, carried, guess_template, load_garment, place_on_body
+from ._garment import (
+    HANGS,
+    LONG,
+    NEAREST,
+    carried,
+    guess_template,
+    hangs_off,
+    load_garment,
+    place_on_body,
+)
 from ._mesh_file import mesh_name, read_mesh
 from ._obj import write_obj
 
 # Shares and lengths beyond which a garment is worth a word [1], [m].
-_INSIDE, _LONG, _FINE, _MISSED = 0.02, 0.04, 0.003, 0.1
-_HANGS, _TOPMOST = 0.02, 0.1
+_INSIDE, _FINE, _MISSED = 0.02, 0.003, 0.1
 # Sizes within which meshes are alike, and what turning one has to gain [m].
 _UNLIKE, _TURNED = 0.1, 0.001
 # Rotations that make an axis of a file Y.
@@ -134,8 +142,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     health = mesh_health(mesh)
     distance, _ = clearance(skin, np.asarray(v, np.float32))
     inside = float(np.mean(distance < NEAREST))
-    height = np.asarray(v)[:, 1]
-    hangs = float(distance[height >= height.max() - _TOPMOST * np.ptp(height)].min())
+    hangs = hangs_off(v, distance)
     corner = np.asarray(v)[raw.faces]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     _, away = clearance(skin, corner.mean(axis=1).astype(np.float32))
@@ -159,12 +166,12 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         )
     if inside > _INSIDE:
         problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
-    if hangs > _HANGS:
+    if hangs > HANGS:
         problems.append(
             f"its top stays {1e3 * hangs:.0f} mm off the skin, where nothing holds it up."
         )
         options.append("--drape")
-    if health.longest_edge > _LONG:
+    if health.longest_edge > LONG:
         problems.append(
             f"edges up to {1e3 * health.longest_edge:.0f} mm: too long to fold, and they cut"
             " corners off limbs."
