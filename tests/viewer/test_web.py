@@ -170,6 +170,40 @@ def test_maps_show_the_motion():
     assert maps["top"].shape == (64, 64, 3)
 
 
+def test_live_clothes_are_those_of_the_clip_wherever_it_is_entered(viewer):
+    choice = Choice("walk", ("bottom",), weights="nano", frames=12, live=True)
+    shown = carry_out(choice)
+    assert shown.live is not None and np.isnan(shown.live.milliseconds)
+    clip = shown.garments[0].positions
+    for frame in (0, 1, 2, 9, 10, 4, 4):
+        live = shown.live.frame(frame)["bottom"]
+        assert np.abs(live - clip[frame]).max() < 1e-5, frame
+    assert np.abs(live - clip[9]).max() > 0.01, "the clip moves"
+    assert 0 < shown.live.milliseconds < np.inf
+    # What only the network can answer isn't asked of skinning.
+    assert carry_out(dataclasses.replace(SHORT, live=True)).live is None
+
+
+def test_live_clothes_are_what_the_page_shows_with_their_time(viewer):
+    viewer._playing.value = False
+    viewer._widgets["weights"].value, viewer._widgets["method"].value = "nano", "network"
+    viewer._widgets["live"].value = True
+    shown = viewer.wait()
+    assert shown.choice.live and viewer._pace.visible
+    asked = []
+    frame = shown.live.frame
+    shown.live.frame = lambda index: asked.append(index) or frame(index)
+    for index in (9, 5, 0):
+        viewer._frame.value = index
+    assert asked == [9, 5, 0] and "ms a frame, live" in viewer._pace.content
+    assert "nan" not in viewer._pace.content
+    viewer._widgets["live"].value = False
+    viewer._widgets["method"].value = "lbs"
+    viewer._widgets["weights"].value = SHORT.weights
+    assert viewer.wait().choice == SHORT and not viewer._pace.visible
+    viewer._playing.value = True
+
+
 def test_a_page_is_written_whole(tmp_path):
     path = tmp_path / "walk.html"
     record(path, SHORT)
@@ -203,6 +237,7 @@ def test_the_command_chooses_all_that_the_page_does(tmp_path, monkeypatch):
     monkeypatch.setattr("physxnet_jax.cli._view.Viewer", lambda c, **_: chosen.append(c) or 1 / 0)
     words = ["view", "punch", "--shape", "weight_up=0.5", "--wind", "0", "1", "4"]
     words += ["--fabric", "silk", "--accuracy", "draft", "--self-contact", "--no-push-out"]
+    words += ["--live"]
     with pytest.raises(ZeroDivisionError):
         view(parse(words), Console(file=io.StringIO()))
     assert chosen == [
@@ -214,8 +249,11 @@ def test_the_command_chooses_all_that_the_page_does(tmp_path, monkeypatch):
             accuracy="draft",
             self_contact=True,
             push_out=False,
+            live=True,
         )
     ]
+    assert main(["view", "--live", "--html", str(tmp_path / "a.html")]) == 2
+    assert main(["view", "--live", "--method", "lbs"]) == 2
     assert main(["view", "--shape", "weight_up"]) == 2
     assert main(["view", "--shape", "girth=1", "--html", str(tmp_path / "a.html")]) == 2
     assert main(["view", "--fabric", "tin", "--html", str(tmp_path / "a.html")]) == 2

@@ -321,6 +321,8 @@ class View:
     """Name of network weights."""
     compare: bool = False
     """Simulate the same clothes beside it and colour by the distance."""
+    live: bool = False
+    """Ask the network for each frame in the moment it is shown, and tell what that takes."""
     push_out: bool = True
     """Push vertices that end inside the body onto it."""
     shape: tuple[str, ...] = ()

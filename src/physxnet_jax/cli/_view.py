@@ -6,6 +6,7 @@ import webbrowser
 
 from rich.console import Console
 
+from ..errors import PhysXNetError
 from ..viewer import Choice, Viewer, record
 from ._commands import View
 from ._progress import progress_bars
@@ -20,12 +21,17 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         console: Where to say it.
         over: Ends the viewer when set.
     """
+    if command.live and (command.html is not None or command.method != "network"):
+        raise PhysXNetError(
+            "--live asks the network while the page is open: no --html, no other --method."
+        )
     choice = Choice(
         motion=command.motion,
         wear=command.wear,
         method=command.method,
         weights=command.weights,
         compare=command.compare,
+        live=command.live,
         push_out=command.push_out,
         shape=tuple(parse_shape(command.shape).items()),
         accuracy=command.accuracy,

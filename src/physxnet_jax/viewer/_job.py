@@ -19,6 +19,7 @@ from ..io import DEFAULT, AnimatedMesh, load_predictor, read_card
 from ..models import Predictor
 from ..motion import BLOCK, Motion, clip_transforms, load_motion, stand_on_floor
 from ..simulation import ACCURACY, Air, Effect, SelfContact, prepare_scene, simulate_batch
+from ._live import Live
 from ._maps import frame_maps
 
 Progress = Callable[[str, int, int], None]
@@ -35,6 +36,8 @@ class Choice:
         weights: Which network.
         push_out: Push vertices that end inside the body onto it.
         compare: Simulate the same clothes beside it, and colour by the distance.
+        live: Ask the network for each frame in the moment it is shown, and tell what that
+            takes.
         shape: Shape parameters by name; none for the default shape.
         accuracy: When simulated; the reference is always ``standard``, which taught the
             networks.
@@ -54,6 +57,7 @@ class Choice:
     weights: str = DEFAULT
     push_out: bool = True
     compare: bool = False
+    live: bool = False
     shape: tuple[tuple[str, float], ...] = ()
     accuracy: str = "standard"
     fabric: str | None = None
@@ -80,6 +84,7 @@ class Shown:
         distances: By garment, distance to the reference [m], shape [frames, vertices].
         told: What was done, how fast and how well, as Markdown.
         clip: The motion.
+        live: What computes the garments frame by frame; None if that isn't wanted.
     """
 
     choice: Choice
@@ -91,6 +96,7 @@ class Shown:
     distances: dict[str, np.ndarray]
     told: str
     clip: Motion
+    live: Live | None = None
 
     @property
     def num_frames(self) -> int:
@@ -187,6 +193,8 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
         inside = 100 * float(np.mean(list(dressed.inside.values())))
         lines += [f"{choice.method}: {cost}", f"{inside:.2f} % of vertices inside the body"]
         lines.append(_known_error(choice))
+        # A note may name a file; the page takes HTML.
+        lines += [html.escape(note) for note in dressed.notes]
     distances = {}
     if choice.compare and choice.wear and choice.method != "simulate":
         taught = dataclasses.replace(choice, accuracy="standard")
@@ -200,6 +208,11 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
             lines.append(f"{name}: {rmse:.1f} mm RMSE from the simulation beside it")
     world, shift = clip_transforms(body, rest, clip)
     told = "\n".join(f"* {line}" for line in lines if line)
+    live = None
+    if choice.live and choice.wear and choice.method == "network":
+        live = Live(
+            clip, choice.wear, weights=choice.weights, shape=shape, push_out=choice.push_out
+        )
     return Shown(
         choice,
         garments,
@@ -210,6 +223,7 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
         distances,
         told,
         clip,
+        live,
     )
 
 

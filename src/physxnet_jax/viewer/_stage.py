@@ -46,15 +46,23 @@ class Stage:
                 )
         self.show(0)
 
-    def show(self, frame: int) -> None:
-        """Moves all to a frame."""
+    def show(
+        self, frame: int, worn: dict[str, Float[np.ndarray, "vertices 3"]] | None = None
+    ) -> None:
+        """Moves all to a frame.
+
+        Args:
+            frame: Which one.
+            worn: Vertices of garments [m] where they aren't to be those of the clip.
+        """
         shown = self.shown
         turns = Rotation.from_matrix(shown.world[frame]).as_quat(scalar_first=True)
         for place, body in zip((0.0 * BESIDE, BESIDE), self._bodies, strict=False):
             for bone, q, p in zip(body.bones, turns, shown.shift[frame] + place, strict=True):
                 bone.wxyz, bone.position = q, p
         for mesh, place, handle in self._meshes:
-            handle.vertices = mesh.positions[frame] + place
+            here = None if worn is None or place is BESIDE else worn.get(mesh.name)
+            handle.vertices = (mesh.positions[frame] if here is None else here) + place
         for mesh in shown.garments:
             if mesh.name in self._dots:
                 dots = self._dots[mesh.name]

@@ -106,6 +106,7 @@ class Viewer:
             weights=w["weights"].value,
             push_out=w["push_out"].value,
             compare=w["compare"].value,
+            live=w["live"].value,
             shape=shape,
             accuracy=w["accuracy"].value,
             fabric=None if w["fabric"].value == "as cut" else w["fabric"].value,
@@ -242,6 +243,8 @@ class Viewer:
             )
             w["push_out"] = gui.add_checkbox("push out of the body", choice.push_out)
             w["compare"] = gui.add_checkbox("simulation beside it", choice.compare)
+            w["live"] = gui.add_checkbox("clothe live, as it plays", choice.live)
+            self._pace = gui.add_markdown("", visible=False)
         strongest = max(10.0, *map(abs, choice.wind))
         reach = (-strongest, strongest, 0.5)
         with gui.add_folder("When simulating", expand_by_default=False):
@@ -359,8 +362,14 @@ class Viewer:
             if self._stage is None or self.shown is None:
                 return
             frame = min(int(self._frame.value), self.shown.num_frames - 1)
+            live = self.shown.live
+            worn = None if live is None else live.frame(frame)
             with self.server.atomic():
-                self._stage.show(frame)
+                self._stage.show(frame, worn)
+            self._pace.visible = live is not None
+            # A number that changes with every frame can't be read.
+            if live is not None and frame % 10 == 0:
+                self._pace.content = f"{live.milliseconds:.1f} ms a frame, live"
             # While playing only now and then: they cost more than the frame.
             if self._show_maps.value != self._maps_folder.visible:
                 self._maps_folder.visible = self._show_maps.value
