@@ -23,7 +23,8 @@ _CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach
 
 
 def main() -> None:
-    viewer = Viewer(Choice("walk", ("top", "bottom"), weights="small", frames=60))
+    choice = Choice("walk", ("top", "bottom"), weights="small", frames=60, live=True)
+    viewer = Viewer(choice)
     viewer.wait()
     viewer._playing.value = False
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
@@ -42,7 +43,10 @@ def main() -> None:
             time.sleep(5)
             iio.imwrite(DOCS / f"viewer-{name}.png", page.picture().astype(np.uint8))
 
+        for frame in range(50):
+            viewer._frame.value = frame
         shoot("network", 20)
+        viewer._widgets["live"].value = False
         viewer._worn["top"].value = viewer._worn["bottom"].value = False
         viewer._worn["dress"].value = True
         viewer._show_maps.value = True
