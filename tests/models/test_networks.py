@@ -298,6 +298,7 @@ def test_dressing_is_differentiable_in_the_pose(worn, body, rest, family):
     poses, root = motion.rotations[20:25], motion.root[20:25]
     bend = body.joint("LeftArm")
 
+    @jax.jit
     def height(angle):
         half = 0.5 * angle
         turn = jnp.stack([jnp.cos(half), jnp.zeros(()), jnp.zeros(()), jnp.sin(half)])

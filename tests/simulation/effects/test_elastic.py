@@ -32,11 +32,20 @@ def prepared(effect, garment):
     return scene.effects[0], scene.assembly.rest
 
 
+@jax.jit
+def begun(effect, base):
+    return effect.begin(base, None, None, CLOCK, ())
+
+
+@jax.jit
+def stored(effect, d, base):
+    return effect.energy(d, begun(effect, base))
+
+
 def energy(effect, rest, x):
     """Energy at positions x, with the rest shape as the block's base."""
     base = jnp.asarray(rest, jnp.float32)[:, :, None]
-    context = effect.begin(base, None, None, CLOCK, ())
-    return effect.energy(jnp.asarray(x, jnp.float32)[:, :, None] - base, context)[0]
+    return stored(effect, jnp.asarray(x, jnp.float32)[:, :, None] - base, base)[0]
 
 
 def turned(x, seed):
@@ -110,8 +119,8 @@ def test_cylinders_along_warp_and_weft_store_half_k_kappa_squared_an_area(effect
     covered = size**2 * (1 - 2 / (3 * (n - 1)))
     expected = 0.5 * 1e-4 / radius**2 * covered
     for angle, bound in ((0.0, 0.06), (np.pi / 2, 0.06)):
-        stored = float(energy(e, rest, rolled(rest, angle, radius)))
-        assert stored == pytest.approx(expected, rel=bound)
+        found = float(energy(e, rest, rolled(rest, angle, radius)))
+        assert found == pytest.approx(expected, rel=bound)
     # Across the diagonals a grid is stiffer: known, and not more than this.
     across = float(energy(e, rest, rolled(rest, np.pi / 4, radius)))
     assert 1.0 < across / expected < 1.6
@@ -174,16 +183,16 @@ def test_gradients_of_constraints_are_those_of_their_values(effect):
     assert isinstance(e, Coloured)
     x = rest + np.random.default_rng(3).normal(size=rest.shape) * 0.02
     base = jnp.asarray(rest, jnp.float32)[:, :, None]
-    context = e.begin(base, None, None, CLOCK, ())
+    context = begun(e, base)
     d = jnp.asarray(x, jnp.float32)[:, :, None] - base
     corners = e._corners([d[i] for i in e.group.index], context[0])
     for law in e.measure(e.group.law, corners):
-        c = law(corners)
+        c = jax.jit(law)(corners)
 
         def value(y, law=law):
             return law(tuple(q - y[0] for q in y)).value.sum()
 
-        slope = jax.grad(value)(corners)
+        slope = jax.jit(jax.grad(value))(corners)
         scale = max(float(jnp.abs(s).max()) for s in slope) + 1e-6
         for mine, theirs in zip(c.gradients, slope, strict=True):
             # A limit that isn't reached has no slope, and moves nothing.
@@ -200,11 +209,10 @@ def test_hessians_are_symmetric_positive_and_near_the_energys(effect):
     x = rest.mean(0) + (rest - rest.mean(0)) * 1.02
     x[:, 1] += 1e-4 * np.random.default_rng(0).normal(size=count)
     base = jnp.asarray(rest, jnp.float32)[:, :, None]
-    context = e.begin(base, None, None, CLOCK, ())
     d = jnp.asarray(x, jnp.float32)[:, :, None] - base
     pairs = np.asarray(e.coupled())
     full = np.zeros((count, 3, count, 3))
-    values = e.hessian(d, context)
+    values = jax.jit(lambda y: e.hessian(y, begun(e, base)))(d)
     if values is not None:
         for (a, b), v in zip(pairs, np.asarray(values)[:, 0], strict=True):
             full[a, :, b] += v
@@ -215,7 +223,7 @@ def test_hessians_are_symmetric_positive_and_near_the_energys(effect):
     full = full.reshape(3 * count, 3 * count)
     np.testing.assert_allclose(full, full.T, atol=1e-4 * np.abs(full).max())
     assert np.linalg.eigvalsh(full).min() > -1e-5 * np.abs(full).max()
-    exact = jax.hessian(lambda y: e.energy(y, context)[0])(d)
+    exact = jax.jit(jax.hessian(lambda y: stored(e, y, base)[0]))(d)
     exact = np.asarray(exact)[:, :, 0, :, :, 0].reshape(3 * count, 3 * count)
     assert np.abs(full - exact).max() < 0.1 * np.abs(exact).max()
 
@@ -246,11 +254,15 @@ def test_slivers_and_collapsed_triangles_keep_value_and_gradient_finite():
     for effect in (*ELASTIC, StrainLimit()):
         e, rest = prepared(effect, g)
         base = jnp.asarray(rest, jnp.float32)[:, :, None]
+        project = jax.jit(
+            lambda d, e=e, base=base: e.project(
+                d, d, begun(e, base), jnp.float32(1.0), (0.001, 0.1)
+            )
+        )
+        change = jax.jit(jax.value_and_grad(lambda d, e=e, base=base: stored(e, d, base).sum()))
         for x in (rest, np.zeros_like(rest), rest * [1, 1, 0]):
-            context = e.begin(base, None, None, CLOCK, ())
             d = jnp.asarray(x, jnp.float32)[:, :, None] - base
-            moved = e.project(d, d, context, jnp.float32(1.0), (0.001, 0.1))
-            assert np.isfinite(np.asarray(moved)).all(), (effect, x)
+            assert np.isfinite(np.asarray(project(d))).all(), (effect, x)
             if e.elastic:
-                value, slope = jax.value_and_grad(lambda y, e=e, c=context: e.energy(y, c).sum())(d)
+                value, slope = change(d)
                 assert np.isfinite(float(value)) and np.isfinite(np.asarray(slope)).all()
