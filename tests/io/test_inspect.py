@@ -261,3 +261,18 @@ def test_what_falls_off_is_refused(tmp_path):
     hoop = carried(make_mesh(v, faces), "top", "hoop", load_body())
     with pytest.raises(MeshError, match="hoop: falls off"):
         drape(hoop)
+
+
+@pytest.mark.parametrize("name", ["top", "bottom", "dress"])
+def test_a_template_is_reported_as_its_file_is(tmp_path, name):
+    g = template(name)
+    path = saved(tmp_path, "a.obj", np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces))
+    named, read = (load_garment(what)[1] for what in (name, path))
+    assert (named.vertices, named.faces, named.topology) == (
+        read.vertices,
+        read.faces,
+        read.topology,
+    )
+    for field in ("distance", "hangs", "longest_edge", "inside"):
+        assert getattr(named, field) == pytest.approx(getattr(read, field), abs=1e-6), field
+    assert named.warning is None and read.warning is None and named.distance > 0.005

@@ -12,7 +12,7 @@ from ..body import Body, load_body
 from ..errors import PhysXNetError
 from ..garment import Garment
 from ..geometry import Smoothing
-from ..io import DEFAULT, AnimatedMesh, load_garment, load_predictor
+from ..io import DEFAULT, AnimatedMesh, load_predictor
 from ..models import Predictor, Wearable, fold_batch_norm, make_surface, make_wearable
 from ..motion import (
     Motion,
@@ -33,7 +33,7 @@ from ._character import (
     on_character,
 )
 from ._layers import make_layers
-from ._meshes import animated_meshes, with_names
+from ._meshes import animated_meshes, worn_garments
 from ._push_out import make_patch, tuck_in
 from ._stages import Stage, Watch
 
@@ -157,16 +157,7 @@ def dress(
     with watch("garments"):
         # A character's clothes are modelled on the body as it is, and carried over.
         on = body if person is None else load_body()
-        notes, garments = [] if person is None else [*person.notes], []
-        for worn in wear:
-            if isinstance(worn, Garment):
-                garments.append(worn)
-                continue
-            garment, found = load_garment(worn, body=on)
-            garments.append(garment)
-            if found.warning is not None:
-                notes.append(found.warning)
-        garments = with_names(garments)
+        garments, notes = worn_garments(wear, on)
         if person is not None:
             garments = [on_character(g, person) for g in garments]
         else:
@@ -227,7 +218,7 @@ def dress(
         inside if inside_raw is None else inside_raw,
         inside,
         method,
-        tuple(notes),
+        notes if person is None else (*person.notes, *notes),
     )
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..garment import Garment
 from ..geometry import vertex_normals
-from ..io import DEFAULT, load_garment, load_predictor
+from ..io import DEFAULT, load_predictor
 from ..models import (
     Predictor,
     Stream,
@@ -27,7 +27,7 @@ from ..models import (
 from ..typing import pytree
 from ._dress import as_on, bound_wearable, fit_surface
 from ._layers import Layer, lift_layers, lift_off, make_layers
-from ._meshes import with_names
+from ._meshes import worn_garments
 from ._push_out import SkinPatch, each_frame, make_patch, push_out, tuck_in
 
 Precision = Literal["float32", "bfloat16"]
@@ -115,9 +115,7 @@ def make_dresser(
     """
     body = load_body() if body is None else body
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
-    garments = with_names(
-        [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
-    )
+    garments, _ = worn_garments(wear, body)
     garments = [as_on(body, g) for g in garments]
     predictor = weights if isinstance(weights, Predictor) else load_predictor(weights)
     predictor = at_precision(fit_surface(predictor, body, rest, shape), precision)

@@ -1,6 +1,7 @@
 """What is written and shown: the body and its garments as animated meshes."""
 
 import dataclasses
+import pathlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,8 +9,8 @@ import numpy as np
 
 from ..body import Body
 from ..errors import PhysXNetError
-from ..garment import Garment
-from ..io import AnimatedMesh
+from ..garment import TEMPLATES, Garment, template
+from ..io import AnimatedMesh, load_garment
 from ..motion import Motion, body_animation
 
 _COLOURS = ((0.16, 0.27, 0.55), (0.55, 0.28, 0.20), (0.25, 0.45, 0.30), (0.45, 0.25, 0.45))
@@ -56,16 +57,34 @@ def animated_meshes(
     return tuple(meshes)
 
 
-def with_names(garments: list[Garment]) -> list[Garment]:
-    """Garments with names that differ."""
+def worn_garments(
+    wear: Sequence[Garment | str | pathlib.Path], body: Body
+) -> tuple[list[Garment], tuple[str, ...]]:
+    """Garments with names that differ, and what to know about the files they come from.
+
+    Args:
+        wear: Garments, garment files or template names.
+        body: What files are modelled on.
+
+    Raises:
+        PhysXNetError: A file that can't be read or worn, or nothing to wear.
+    """
     taken = {"body"}
-    out = []
-    for g in garments:
-        name, count = g.name, 2
+    garments, notes = [], []
+    for word in wear:
+        if isinstance(word, Garment):
+            garment = word
+        elif str(word) in TEMPLATES:
+            garment = template(str(word))  # pyright: ignore[reportArgumentType]
+        else:
+            garment, found = load_garment(word, body=body)
+            if found.warning is not None:
+                notes.append(found.warning)
+        name, count = garment.name, 2
         while name in taken:
-            name, count = f"{g.name}_{count}", count + 1
+            name, count = f"{garment.name}_{count}", count + 1
         taken.add(name)
-        out.append(dataclasses.replace(g, name=name))
-    if not out:
+        garments.append(dataclasses.replace(garment, name=name))
+    if not garments:
         raise PhysXNetError("Nothing to wear: name at least one garment.")
-    return out
+    return garments, tuple(notes)

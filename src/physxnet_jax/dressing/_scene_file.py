@@ -15,7 +15,7 @@ from ..io import load_garment
 from ..motion import Motion, load_motion, make_motion, resample
 from ..simulation import ACCURACY, EFFECTS, Effect, Scene, standard_effects
 from ._layers import inside_out
-from ._meshes import with_names
+from ._meshes import worn_garments
 
 _KEYS: dict[str, type | tuple[type, ...]] = {
     "motion": str,
@@ -103,9 +103,7 @@ def make_scene(
         if frames < 1:
             raise FormatError(f"frames is {frames}; ask for at least one.")
         clip = dataclasses.replace(clip, rotations=clip.rotations[:frames], root=clip.root[:frames])
-    garments = with_names(
-        [g if isinstance(g, Garment) else load_garment(g, body=body)[0] for g in wear]
-    )
+    garments, _ = worn_garments(wear, body)
     if fabric is not None:
         garments = [dataclasses.replace(g, fabric=FABRICS[fabric]) for g in garments]
     garments = inside_out(garments)

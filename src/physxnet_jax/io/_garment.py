@@ -119,19 +119,11 @@ def load_garment(
         path, kind = file, told  # pyright: ignore[reportAssignmentType]
     if str(path) in TEMPLATES:
         g = template(str(path))  # pyright: ignore[reportArgumentType]
-        report = GarmentReport(
-            str(path),
-            "m",
-            "Y",
-            g.num_vertices,
-            g.mesh.faces.shape[0],
-            manifold_report(np.asarray(g.mesh.faces)),
-            0.0,
-            0.01,
-            g.template,
-            0.0,
-            _longest_edge(np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces)),
-        )
+        v, faces = np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces)
+        # Templates come on the built-in body, whatever body they are carried by.
+        distance, _ = clearance(load_body().rest_mesh(), v)
+        near = distance < NEAREST
+        report = _report(str(path), "m", "Y", v, faces, near, distance, g.template)
         return g, report
     path = pathlib.Path(path)
     if split_part(path)[0].suffix.lower() not in GARMENT_FORMATS:
@@ -151,20 +143,34 @@ def load_garment(
         mesh_name(path),
         body,
     )
-    report = GarmentReport(
-        str(path),
+    report = _report(str(path), unit, up, v, raw.faces, inside, distance, kind)
+    return garment, report
+
+
+def _report(
+    path: str,
+    unit: str,
+    up: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    inside: np.ndarray,
+    distance: np.ndarray,
+    kind: Template,
+) -> GarmentReport:
+    ends = vertices[mesh_edges(faces).vertices]
+    return GarmentReport(
+        path,
         unit,
         up,
-        len(v),
-        len(raw.faces),
-        manifold_report(raw.faces),
+        len(vertices),
+        len(faces),
+        manifold_report(faces),
         float(inside.mean()),
         float(np.median(np.abs(distance))),
         kind,
-        hangs_off(v, distance),
-        _longest_edge(np.asarray(v), raw.faces),
+        hangs_off(vertices, distance),
+        float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max(initial=0.0)),
     )
-    return garment, report
 
 
 def hangs_off(
@@ -176,11 +182,6 @@ def hangs_off(
     """
     height = np.asarray(vertices)[:, 1]
     return float(distance[height >= height.max() - _TOPMOST * np.ptp(height)].min())
-
-
-def _longest_edge(vertices: np.ndarray, faces: np.ndarray) -> float:
-    ends = vertices[mesh_edges(faces).vertices]
-    return float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max(initial=0.0))
 
 
 def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
