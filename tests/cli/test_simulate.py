@@ -15,7 +15,8 @@ from physxnet_jax.errors import (
     SimulationError,
 )
 from physxnet_jax.evaluation import price_effects, recommend_effects
-from physxnet_jax.garment import square_sheet
+from physxnet_jax.garment import square_sheet, template
+from physxnet_jax.io import write_obj
 from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import (
     XPBD,
@@ -84,6 +85,24 @@ def test_scene_files_say_what_they_hold(tmp_path):
     both = make_scene("walk", ["top", "bottom"])
     assert [g.name for g in both.scene.garments] == ["bottom", "top"], "the innermost first"
     assert LayerContact() in both.scene.effects
+
+
+def test_what_dress_tells_of_a_garment_file_is_told_here_too(tmp_path, capsys):
+    mesh = template("bottom").mesh
+    vertices = np.array(mesh.vertices)
+    # Caught on a nail: its edges are too long to fold.
+    vertices[np.argmax(vertices[:, 2])] += [0.0, 0.0, 0.08]
+    write_obj(tmp_path / "caught.obj", vertices, np.asarray(mesh.faces))
+    scene = tmp_path / "scene.toml"
+    scene.write_text(TOML.replace('"bottom"', '"caught.obj=bottom"'))
+    (note,) = load_scene(scene).notes
+    assert "caught.obj" in note and "physxnet" in note
+    assert load_scene(scene).scene.garments[0].fabric.density == 0.07, "the fabric is the scene's"
+    assert main(["simulate", str(scene), "--frames", "2"]) == 0
+    assert "caught.obj" in capsys.readouterr().out
+    assert main(["simulate", str(scene), "--frames", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["notes"] == [note]
+    assert not make_scene("walk", ["bottom"]).notes
 
 
 def test_a_folder_of_other_things_is_neither_used_nor_removed(tmp_path):

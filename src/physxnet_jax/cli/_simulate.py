@@ -88,9 +88,12 @@ def simulate(command: Simulate, console: Console) -> int:
         if command.preview is not None:
             written.append(render_preview(command.preview, meshes, rollout.fps, progress=bars))
     if command.json:
-        print_json(_report(rollout, scene.effects, took) | {"files": written})
+        told = {"notes": list(job.notes), "files": written}
+        print_json(_report(rollout, scene.effects, took) | told)
         return 0
     console.print(_summary(rollout, scene.effects, took))
+    for note in job.notes:
+        console.print(note, highlight=False, markup=False)
     for path in written:
         console.print(f"wrote {path} (import at {rollout.fps:g} fps)", highlight=False)
     return 0
@@ -210,11 +213,14 @@ def price(command: Effects, console: Console) -> int:
             f"{r.mflop:.2f}",
         )
     console.print(table)
+    for note in job.notes:
+        console.print(note, highlight=False, markup=False)
     for a in advice:
         console.print(f"{a.effect}: {'needed' if a.needed else 'not needed'}. {a.why}")
     data = {
         "effects": [dataclasses.asdict(r) for r in rows],
         "recommendation": [dataclasses.asdict(a) for a in advice],
+        "notes": list(job.notes),
     }
     if command.out is not None:
         with whole_file(command.out) as part:

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 from ..body import load_body
 from ..errors import FormatError
 from ..garment import FABRICS, Garment
-from ..io import load_garment
 from ..motion import Motion, load_motion, make_motion, resample
 from ..simulation import ACCURACY, EFFECTS, Effect, Scene, standard_effects
 from ._layers import inside_out
@@ -40,11 +39,13 @@ class SceneFile:
         scene: Garments, effects, shape.
         motion: The body's motion.
         accuracy: ``draft``, ``standard`` or ``fine``.
+        notes: What is good to know of garments read from files.
     """
 
     scene: Scene
     motion: Motion
     accuracy: str = "standard"
+    notes: tuple[str, ...] = ()
 
 
 def make_scene(
@@ -103,12 +104,13 @@ def make_scene(
         if frames < 1:
             raise FormatError(f"frames is {frames}; ask for at least one.")
         clip = dataclasses.replace(clip, rotations=clip.rotations[:frames], root=clip.root[:frames])
-    garments, _ = worn_garments(wear, body)
+    garments, notes = worn_garments(wear, body)
     if fabric is not None:
         garments = [dataclasses.replace(g, fabric=FABRICS[fabric]) for g in garments]
     garments = inside_out(garments)
     acting = standard_effects(len(garments)) if effects is None else tuple(effects)
-    return SceneFile(Scene(tuple(garments), _merged(acting, also), body, shape), clip, accuracy)
+    scene = Scene(tuple(garments), _merged(acting, also), body, shape)
+    return SceneFile(scene, clip, accuracy, notes)
 
 
 def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneFile:
@@ -161,7 +163,6 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
     words = [
         {"file": g} if isinstance(g, str) else g for g in text.get("garments", ["top", "bottom"])
     ]
-    garments = []
     for g in words:
         told = set(g) if isinstance(g, dict) else {str(g)}
         if told - {"file", "fabric"} or not all(isinstance(x, str) for x in g.values()):
@@ -170,15 +171,14 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
             )
         if "file" not in g:
             raise FormatError(f"{path}: a garment has no file.")
-        garment = load_garment(_beside(path, g["file"]), body=load_body())[0]
-        if "fabric" in g:
-            if g["fabric"] not in FABRICS:
-                raise FormatError(
-                    f"{path}: no fabric '{g['fabric']}'; there are {', '.join(FABRICS)}."
-                )
-            garment = dataclasses.replace(garment, fabric=FABRICS[g["fabric"]])
-        garments.append(garment)
-    return make_scene(
+        if "fabric" in g and g["fabric"] not in FABRICS:
+            raise FormatError(f"{path}: no fabric '{g['fabric']}'; there are {', '.join(FABRICS)}.")
+    worn, notes = worn_garments([_beside(path, g["file"]) for g in words], load_body())
+    garments = [
+        dataclasses.replace(w, fabric=FABRICS[g["fabric"]]) if "fabric" in g else w
+        for w, g in zip(worn, words, strict=True)
+    ]
+    made = make_scene(
         _beside(path, text["motion"]),
         garments,
         fps=float(text.get("fps", 30.0)),
@@ -191,6 +191,7 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         effects=_effects(path, text["effects"]) if "effects" in text else None,
         also=_effects(path, text.get("also", {})),
     )
+    return dataclasses.replace(made, notes=notes)
 
 
 def _beside(path: pathlib.Path, word: str) -> str | pathlib.Path:
