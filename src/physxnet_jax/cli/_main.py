@@ -283,11 +283,11 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     for table in closing_table(clip):
         console.print(table)
     for note in clip.notes:
-        console.print(note, highlight=False, markup=False)
+        console.print(note, highlight=False, markup=False, soft_wrap=True)
     if picked is not None:
         console.print(picked.told, highlight=False)
     for path in written:
-        console.print(f"wrote {path} (import at {clip.fps:g} fps)", highlight=False)
+        console.print(f"wrote {path} (import at {clip.fps:g} fps)", highlight=False, soft_wrap=True)
     return 0
 
 

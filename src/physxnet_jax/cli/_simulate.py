@@ -93,9 +93,11 @@ def simulate(command: Simulate, console: Console) -> int:
         return 0
     console.print(_summary(rollout, scene.effects, took))
     for note in job.notes:
-        console.print(note, highlight=False, markup=False)
+        console.print(note, highlight=False, markup=False, soft_wrap=True)
     for path in written:
-        console.print(f"wrote {path} (import at {rollout.fps:g} fps)", highlight=False)
+        console.print(
+            f"wrote {path} (import at {rollout.fps:g} fps)", highlight=False, soft_wrap=True
+        )
     return 0
 
 
@@ -214,7 +216,7 @@ def price(command: Effects, console: Console) -> int:
         )
     console.print(table)
     for note in job.notes:
-        console.print(note, highlight=False, markup=False)
+        console.print(note, highlight=False, markup=False, soft_wrap=True)
     for a in advice:
         console.print(f"{a.effect}: {'needed' if a.needed else 'not needed'}. {a.why}")
     data = {
