@@ -65,6 +65,8 @@ VARIANTS: dict[str, tuple[TrainConfig, tuple[str, ...]]] = {
     "adversarial": (varied(adversarial=True), ("data",)),
     "squared": (varied(squared=True), ("data",)),
     "by Muon": (varied(optimiser="muon"), ("data",)),
+    "differences along edges": (varied(edge_share=0.5), ("data",)),
+    "four scales": (varied(scales=4), ("data",)),
     "one frame": (varied(model=seen(frames=1)), ("data",)),
     "no acceleration": (varied(model=seen(acceleration=False)), ("data",)),
     "no gravity": (varied(model=seen(gravity=False)), ("data",)),

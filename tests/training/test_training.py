@@ -22,10 +22,12 @@ from physxnet_jax.training import (
     map_picture,
     masked_l1,
     masked_l2,
+    pooled_l1,
     read_metrics,
     soft_labels,
     teaches,
     train,
+    vertex_loss,
 )
 from physxnet_jax.training._batches import MAX_OFFSET, load_frames
 from physxnet_jax.training._checkpoint import Checkpoints
@@ -175,6 +177,69 @@ def test_errors_at_vertices_are_learned_as_they_are_read(tmp_path):
         dataclasses.replace(config, vertex_share=2.0)
     with pytest.raises(ValueError, match="local family"):
         dataclasses.replace(config, model=dataclasses.replace(model, inputs=PAPER))
+
+
+def test_errors_of_larger_parts_of_a_map_in_closed_form():
+    rows, columns = np.indices((8, 8))
+    checks = jnp.asarray(np.where((rows + columns) % 2, 1.0, -1.0), jnp.float32)
+    checks = jnp.broadcast_to(checks[None, :, :, None], (2, 8, 8, 3))
+    zeros, everywhere = jnp.zeros_like(checks), jnp.ones((2, 8, 8, 1))
+    for scales in (1, 2, 4):
+        assert float(pooled_l1(zeros + 0.5, zeros, everywhere, scales)) == 0.5
+        assert float(pooled_l1(checks, zeros, everywhere, scales)) == 1.0 / scales
+        assert float(pooled_l1(checks, zeros, 0.0 * everywhere, scales)) == 0.0
+    # One size is the loss at texels, whatever counts; what doesn't has no gradient.
+    rng = np.random.default_rng(0)
+    a, b = (jnp.asarray(rng.normal(size=(2, 8, 8, 3)), jnp.float32) for _ in range(2))
+    valid, weight = jnp.asarray(rng.random(64) < 0.6), jnp.asarray([1.0, 0.0])
+    mask = (weight[:, None] * valid.astype(jnp.float32)[None]).reshape(2, 8, 8, 1)
+    flat = masked_l1(a.reshape(2, 64, 3), b.reshape(2, 64, 3), valid, weight)
+    np.testing.assert_allclose(float(pooled_l1(a, b, mask, 1)), float(flat), rtol=1e-6)
+    slope = jax.grad(pooled_l1)(a, b, mask, 4)
+    assert np.isfinite(slope).all() and not np.asarray(slope)[np.asarray(mask[..., 0]) == 0].any()
+
+
+def test_differences_along_edges_know_nothing_of_what_all_vertices_share():
+    edges = jnp.asarray([[0, 1], [1, 2]])
+    target, weight = jnp.zeros((2, 3, 3)), jnp.asarray([1.0, 0.0])
+    shifted = target + 2.0
+    bent = target.at[0, 1].set(3.0)
+    for distance, moved, folded, differences in (
+        (masked_l1, 2.0, 1.0, 3.0),
+        (masked_l2, 4.0, 3.0, 9.0),
+    ):
+        for share in (0.0, 0.25, 1.0):
+            value = vertex_loss(shifted, target, edges, weight, distance, share)
+            assert float(value) == pytest.approx((1.0 - share) * moved)
+            value = vertex_loss(bent, target, edges, weight, distance, share)
+            assert float(value) == pytest.approx((1.0 - share) * folded + share * differences)
+
+
+def test_losses_along_edges_and_of_larger_parts_teach(tmp_path):
+    model = dataclasses.replace(CONFIG.model, templates=("bottom",))
+    config = dataclasses.replace(CONFIG, model=model, adversarial=False, epochs=20)
+    config = dataclasses.replace(config, vertex_share=0.7, edge_share=0.5, scales=3)
+    data = sequence()
+    predictor = train(config, [data], tmp_path, steps=80)
+    skinned = skinning()(data.motion, "bottom").positions
+    left = network(predictor)(data.motion, "bottom").positions - skinned - data.offsets["bottom"]
+    there = np.linalg.norm(data.offsets["bottom"], axis=2).mean()
+    assert np.linalg.norm(left, axis=2).mean() < 0.8 * there
+
+
+@pytest.mark.parametrize(
+    "changes, says",
+    [
+        ({"vertex_share": 0.5, "edge_share": 1.5}, "0 to 1"),
+        ({"edge_share": 0.5}, "share of vertex_share"),
+        ({"scales": 0}, "at least 1"),
+        ({"scales": 7}, "halve that often"),
+        ({"scales": 2, "squared": True}, "choose one"),
+    ],
+)
+def test_losses_that_can_not_be_are_refused(changes, says):
+    with pytest.raises(ValueError, match=says):
+        dataclasses.replace(CONFIG, **changes)
 
 
 def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):

@@ -16,7 +16,9 @@ from ._losses import (
     discriminator_loss as discriminator_loss,
     masked_l1 as masked_l1,
     masked_l2 as masked_l2,
+    pooled_l1 as pooled_l1,
     soft_labels as soft_labels,
+    vertex_loss as vertex_loss,
 )
 from ._optimiser import (
     make_optimiser as make_optimiser,

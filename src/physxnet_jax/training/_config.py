@@ -30,6 +30,10 @@ class TrainConfig:
         vertex_share: Share of the L1 loss that is taken at the vertices of the templates,
             where maps are read, instead of at texels: maps then learn to make up for
             what reading them loses. 0 is the paper's; ``local`` only.
+        edge_share: Share of the loss at vertices that is taken on the differences along
+            the templates' edges, from which strain and folds come.
+        scales: The loss at texels is the mean over this many sizes of maps, each half as
+            wide as the one before; 1 is the paper's.
         adversarial: Whether there is a discriminator at all.
         discriminator_width: Channels of its first layer.
         mirror: Every action is learned from as a mirror shows it, too.
@@ -55,6 +59,8 @@ class TrainConfig:
     l1_weight: float = 100.0
     squared: bool = False
     vertex_share: float = 0.0
+    edge_share: float = 0.0
+    scales: int = 1
     adversarial: bool = True
     discriminator_width: int = 16
     mirror: bool = False
@@ -71,3 +77,14 @@ class TrainConfig:
             raise ValueError(f"vertex_share is {self.vertex_share}; it is a share, 0 to 1.")
         if self.vertex_share and self.model.family != "local":
             raise ValueError("vertex_share needs the local family; the paper's loss has none.")
+        if not 0.0 <= self.edge_share <= 1.0:
+            raise ValueError(f"edge_share is {self.edge_share}; it is a share, 0 to 1.")
+        if self.edge_share and not self.vertex_share:
+            raise ValueError("edge_share is a share of vertex_share, which is 0.")
+        if self.scales > 1 and self.squared:
+            raise ValueError("scales takes absolute errors, squared takes squares; choose one.")
+        size = self.model.resolution
+        if self.scales < 1 or size % 2 ** (self.scales - 1):
+            raise ValueError(
+                f"scales is {self.scales}: at least 1, and maps of {size} must halve that often."
+            )

@@ -16,6 +16,7 @@ from ..data import Sequence, mirrored_sequence
 from ..errors import FormatError, PhysXNetError
 from ..files import whole_file
 from ..garment import template
+from ..geometry import mesh_edges
 from ..models import ModelConfig, Normalisation, Predictor, Surface, make_surface, make_wearable
 from ..uv import Atlas, bind, garment_map_rows, make_atlas
 from ._batches import (
@@ -48,6 +49,7 @@ def prepare_surface(model: ModelConfig) -> tuple[Atlas, Surface, dict[str, Cloth
             surface.rest_dress if t == "dress" else surface.rest,
             surface.weights,
             make_wearable(body, rest, g, bind(atlas, body, rest, g, rows[t].valid)),
+            jnp.asarray(mesh_edges(np.asarray(g.mesh.faces)).vertices),
         )
         for t, g in garments.items()
     }

@@ -1,9 +1,11 @@
 """The paper's losses: adversarial cross entropy with noisy labels, and L1 or L2 on texels."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 
 def soft_labels(
@@ -76,6 +78,70 @@ def masked_l2(
 ) -> Float[Array, ""]:
     """Mean squared error, of the same as `masked_l1`."""
     return _masked_mean(jnp.square(predicted - target), valid, sample_weight)
+
+
+def pooled_l1(
+    predicted: Float[Array, "batch height width 3"],
+    target: Float[Array, "batch height width 3"],
+    mask: Float[Array, "batch height width 1"],
+    scales: int,
+) -> Float[Array, ""]:
+    """Mean absolute error of maps at several sizes: each halves the one before.
+
+    An error that changes its sign from texel to texel counts at the first size alone.
+
+    Args:
+        predicted: Normalised offset maps.
+        target: Normalised offset maps.
+        mask: 1 for texels that count.
+        scales: How many sizes.
+
+    Returns:
+        The mean over sizes, each over the texels that count; zero if nothing counts.
+    """
+    error, total = (predicted - target) * mask, jnp.zeros(())
+    weight = jnp.maximum(jnp.sum(mask), 1.0)
+    for k in range(scales):
+        if k:
+            n, height, width, _ = error.shape
+            error = jnp.sum(error.reshape(n, height // 2, 2, width // 2, 2, 3), axis=(2, 4))
+        total = total + jnp.sum(jnp.abs(error)) / (3.0 * weight)
+    return total / scales
+
+
+def vertex_loss(
+    predicted: Float[Array, "batch vertices 3"],
+    target: Float[Array, "batch vertices 3"],
+    edges: Int[Array, "edges 2"],
+    sample_weight: Float[Array, " batch"],
+    distance: Callable[..., Float[Array, ""]],
+    edge_share: float,
+) -> Float[Array, ""]:
+    """Error of offsets at vertices and of their differences along edges.
+
+    An error that is the same at all vertices changes no edge: differences tell of strain
+    and folds alone.
+
+    Args:
+        predicted: Normalised offsets.
+        target: Normalised offsets.
+        edges: The vertices of each edge.
+        sample_weight: 1 for samples that count, 0 for those without this garment.
+        distance: `masked_l1` or `masked_l2`.
+        edge_share: Share of the differences, 0 to 1.
+    """
+    everywhere = jnp.ones((target.shape[1],), bool)
+    value = distance(predicted, target, everywhere, sample_weight)
+    if not edge_share:
+        return value
+    a, b = edges.T
+    along = distance(
+        predicted[:, b] - predicted[:, a],
+        target[:, b] - target[:, a],
+        jnp.ones(a.shape, bool),
+        sample_weight,
+    )
+    return (1.0 - edge_share) * value + edge_share * along
 
 
 def _masked_mean(

@@ -25,7 +25,15 @@ from ..typing import pytree
 from ..uv import Atlas, Transference
 from ._batches import target_offsets
 from ._config import TrainConfig
-from ._losses import adversarial_loss, discriminator_loss, masked_l1, masked_l2, soft_labels
+from ._losses import (
+    adversarial_loss,
+    discriminator_loss,
+    masked_l1,
+    masked_l2,
+    pooled_l1,
+    soft_labels,
+    vertex_loss,
+)
 from ._optimiser import make_optimiser
 
 Batch = dict[str, Any]
@@ -67,6 +75,7 @@ class ClothTables:
         anchor: Texel points at rest that the offsets start from [m].
         anchor_weights: Their skinning weights.
         wearable: The template as it is dressed.
+        edges: Vertices of its edges, shape [edges, 2].
     """
 
     to_cloth: Transference
@@ -75,6 +84,7 @@ class ClothTables:
     anchor: Array
     anchor_weights: Array
     wearable: Wearable
+    edges: Array
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,8 +205,16 @@ def make_step(
         wearable = tables[name].wearable
         seen = jnp.where(surface.valid[name][None, :, None], texels, 0.0)
         wanted = target.astype(jnp.float32) * QUANTUM / scale
-        everywhere = jnp.ones((wanted.shape[1],), bool)
-        return distance(wearable.sample(seen), wanted, everywhere, weight)
+        return vertex_loss(
+            wearable.sample(seen), wanted, tables[name].edges, weight, distance, config.edge_share
+        )
+
+    def at_texels(
+        maps: Array, texels: Array, target: Array, name: str, weight: Array, mask: Array
+    ) -> Array:
+        if config.scales == 1:
+            return distance(texels, target, surface.valid[name], weight)
+        return pooled_l1(maps, atlas.to_map(target), mask, config.scales)
 
     @jax.jit
     def look(
@@ -227,7 +245,7 @@ def make_step(
             for t in templates:
                 texels, weight = atlas.from_map(maps[t]), batch[f"weight_{t}"]
                 parts[t] = masked_l1(texels, targets[t], surface.valid[t], weight)
-                value = distance(texels, targets[t], surface.valid[t], weight)
+                value = at_texels(maps[t], texels, targets[t], t, weight, masks[t])
                 if config.vertex_share:
                     read = at_vertices(
                         texels, batch[f"target_{t}"], t, weight, normalisation.offset[t]
