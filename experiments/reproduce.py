@@ -93,6 +93,7 @@ def main() -> None:
         "unseen",
         "mirrored_answer",
         "cloth_memory",
+        "previous_offset",
         "accuracy_cost",
         "peers",
         "engines",

@@ -165,7 +165,7 @@ def test_the_reproduction_shows_what_was_measured():
     rows = [ActionError(**r) for r in told]
     assert summary_table(rows).strip() in text
     assert error_tables(rows).strip() in text
-    for name in ("ablations", "unseen", "mirrored_answer", "cloth_memory"):
+    for name in ("ablations", "unseen", "mirrored_answer", "cloth_memory", "previous_offset"):
         block = re.search(rf"<!-- begin {name} -->\n(.*?)<!-- end {name} -->", text, re.S)
         assert block and block.group(1) == (ROOT / f"experiments/results/{name}.md").read_text()
     made = runpy.run_path(str(ROOT / "experiments/reproduce.py"))
