@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from physxnet_jax.cli import main
-from physxnet_jax.dressing import Rung, calibrate, dress, load_ladder, pick_rung
+from physxnet_jax.dressing import Rung, calibrate, dress, load_ladder, pick_rung, worn_key
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import TEMPLATES
 from physxnet_jax.io import list_weights
@@ -19,7 +19,7 @@ def rung(name, error, inside=0.0):
 
 RUNGS = [rung("fast", 20.0), rung("dirty", 9.0, 0.05), rung("clean", 9.0), rung("exact", 1.0)]
 TIMES = {
-    n: dict.fromkeys(TEMPLATES, ms)
+    n: {"top": ms, "dress+top": 1.5 * ms}
     for n, ms in (("fast", 0.5), ("dirty", 2.0), ("clean", 4.0), ("exact", 90.0))
 }
 
@@ -42,6 +42,12 @@ def test_the_best_within_what_was_asked(asked, picked):
     assert choice.ms_per_frame == TIMES[picked]["top"]
 
 
+def test_the_time_of_garments_worn_together_is_their_own():
+    for worn in (["top", "dress"], ["dress", "top"]):
+        choice = pick_rung(worn, TIMES, RUNGS, budget_ms=3.0)
+        assert (choice.rung.name, choice.ms_per_frame) == ("dirty", 3.0)
+
+
 @settings(max_examples=50, deadline=None)
 @given(
     st.lists(st.tuples(st.floats(0.1, 50), st.floats(0.1, 100)), min_size=1, max_size=6),
@@ -50,8 +56,8 @@ def test_the_best_within_what_was_asked(asked, picked):
 )
 def test_a_budget_is_kept_whatever_the_ladder(pairs, templates, budget):
     rungs = [rung(str(k), e) for k, (e, _) in enumerate(pairs)]
-    times = {str(k): dict.fromkeys(TEMPLATES, ms) for k, (_, ms) in enumerate(pairs)}
-    able = [e for e, ms in pairs if ms * len(templates) <= budget]
+    times = {str(k): {worn_key(templates): ms} for k, (_, ms) in enumerate(pairs)}
+    able = [e for e, ms in pairs if ms <= budget]
     if not able:
         with pytest.raises(PhysXNetError, match="nearest"):
             pick_rung(templates, times, rungs, budget_ms=budget)
@@ -62,8 +68,10 @@ def test_a_budget_is_kept_whatever_the_ladder(pairs, templates, budget):
 
 
 def test_what_cannot_be_had_is_said():
-    with pytest.raises(PhysXNetError, match=r"nearest is fast: 1\.00 ms"):
-        pick_rung(["top", "dress"], TIMES, RUNGS, budget_ms=0.9)
+    with pytest.raises(PhysXNetError, match=r"nearest is fast: 0\.75 ms"):
+        pick_rung(["top", "dress"], TIMES, RUNGS, budget_ms=0.7)
+    with pytest.raises(PhysXNetError, match="a time and an error for bottom"):
+        pick_rung(["bottom"], TIMES, RUNGS, budget_ms=5.0)
     with pytest.raises(PhysXNetError, match="nearest is exact"):
         pick_rung(["top"], TIMES, RUNGS, max_error_mm=0.5)
     with pytest.raises(PhysXNetError, match="either"):
@@ -74,19 +82,23 @@ def test_what_cannot_be_had_is_said():
 
 def test_nothing_is_timed_twice_and_another_machine_is(tmp_path):
     path = tmp_path / "deep" / "times.json"
+    rungs, worn = [rung("lbs", 20.0)], [("bottom",), ("top", "bottom")]
     said = []
-    times = calibrate([rung("lbs", 20.0)], path=path, frames=17, report=lambda *a: said.append(a))
-    assert set(times["lbs"]) == set(TEMPLATES) and all(ms > 0 for ms in times["lbs"].values())
-    assert len(said) == 3
+    times = calibrate(rungs, worn, path=path, frames=17, report=lambda *a: said.append(a))
+    assert set(times["lbs"]) == {"bottom", "bottom+top"}
+    assert all(ms > 0 for ms in times["lbs"].values())
+    assert said[1] == ("timing lbs, top, bottom", 1, 2)
     known = json.loads(path.read_text())
-    known["times"]["lbs"]["top"] = 123.0
+    known["times"]["lbs"]["bottom"] = 123.0
     path.write_text(json.dumps(known))
-    assert calibrate([rung("lbs", 20.0)], path=path)["lbs"]["top"] == 123.0
+    assert calibrate(rungs, worn[:1], path=path)["lbs"]["bottom"] == 123.0
     known["machine"]["device"] = "abacus"
     path.write_text(json.dumps(known))
-    assert calibrate([rung("lbs", 20.0)], path=path, frames=17)["lbs"]["top"] != 123.0
+    assert calibrate(rungs, worn[:1], path=path, frames=17)["lbs"]["bottom"] != 123.0
     path.write_text("{")
-    assert calibrate([rung("lbs", 20.0)], path=path, frames=17)["lbs"]["top"] > 0
+    assert calibrate(rungs, worn[:1], path=path, frames=17)["lbs"]["bottom"] > 0
+    with pytest.raises(ValueError, match="nothing runs twice"):
+        calibrate(rungs, worn[:1], path=tmp_path / "other.json", frames=2)
 
 
 def test_every_rung_of_the_package_can_be_dressed():

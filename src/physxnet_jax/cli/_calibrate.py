@@ -1,19 +1,24 @@
 """`physxnet calibrate`, and what `dress` picks by it."""
 
-from collections.abc import Callable
+import math
+import statistics
+from collections.abc import Callable, Sequence
 
 from rich.console import Console
 from rich.table import Table
 
 from ..dressing import (
+    ALONE_AND_TOGETHER,
     Choice,
+    Rung,
     calibrate as measure,
     calibration_file,
     load_ladder,
     pick_rung,
+    worn_key,
 )
 from ..errors import PhysXNetError
-from ..garment import TEMPLATES
+from ..garment import TEMPLATES, Template
 from ..io import load_garment
 from ._commands import Calibrate, Dress
 from ._progress import print_json, progress_bars
@@ -36,15 +41,22 @@ def calibrate(command: Calibrate, console: Console) -> int:
     table.add_column("method")
     for name in TEMPLATES:
         table.add_column(name, justify="right")
+    table.add_column("all three", justify="right")
     for rung in ladder:
+        errors = {worn_key(w): _mean_error(rung, w) for w in ALONE_AND_TOGETHER}
         cells = [
-            f"{times[rung.name][t]:.2f} | {rung.rmse_mm[t]:.1f}" if t in rung.rmse_mm else "-"
-            for t in TEMPLATES
+            f"{times[rung.name][k]:.2f} | {mm:.1f}" if k in times[rung.name] else "-"
+            for k, mm in errors.items()
         ]
         table.add_row(rung.name, *cells)
     console.print(table)
     console.print(f"kept in {calibration_file()}", highlight=False)
     return 0
+
+
+def _mean_error(rung: Rung, worn: Sequence[Template]) -> float:
+    known = [rung.rmse_mm[t] for t in worn if t in rung.rmse_mm]
+    return statistics.fmean(known) if len(known) == len(worn) else math.nan
 
 
 def choose(command: Dress, progress: Callable[[str, int, int], None]) -> Choice | None:
@@ -55,8 +67,8 @@ def choose(command: Dress, progress: Callable[[str, int, int], None]) -> Choice 
     if command.budget_ms is not None and command.max_error_mm is not None:
         raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
     ladder = load_ladder()
-    templates = [load_garment(g)[0].template for g in command.wear]
-    times = measure(ladder, report=lambda _, k, n: progress("timing", k, n))
+    templates: list[Template] = [load_garment(g)[0].template for g in command.wear]
+    times = measure(ladder, [templates], report=lambda _, k, n: progress("timing", k, n))
     return pick_rung(
         templates,
         times,

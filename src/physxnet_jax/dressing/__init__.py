@@ -33,12 +33,14 @@ from ._dresser import (
 )
 from ._export import EXPORTED as EXPORTED, export_dresser as export_dresser
 from ._ladder import (
+    ALONE_AND_TOGETHER as ALONE_AND_TOGETHER,
     Choice as Choice,
     Rung as Rung,
     calibrate as calibrate,
     calibration_file as calibration_file,
     load_ladder as load_ladder,
     pick_rung as pick_rung,
+    worn_key as worn_key,
 )
 from ._meshes import animated_meshes as animated_meshes
 from ._method import (
