@@ -97,8 +97,17 @@ def test_nothing_is_timed_twice_and_another_machine_is(tmp_path):
     assert calibrate(rungs, worn[:1], path=path, frames=17)["lbs"]["bottom"] != 123.0
     path.write_text("{")
     assert calibrate(rungs, worn[:1], path=path, frames=17)["lbs"]["bottom"] > 0
-    with pytest.raises(ValueError, match="nothing runs twice"):
-        calibrate(rungs, worn[:1], path=tmp_path / "other.json", frames=2)
+
+
+def test_push_out_is_timed_once_for_all_networks(tmp_path):
+    rungs = [rung(n, 10.0) for n in ("nano", "nano+push", "small+push")]
+    path = tmp_path / "times.json"
+    times = calibrate(rungs, [("bottom",)], path=path, frames=16)
+    kept = json.loads(path.read_text())["times"]
+    plain = next(v for k, v in kept.items() if k.startswith("small "))
+    assert kept["push"]["bottom"] >= 0
+    assert times["nano+push"]["bottom"] == times["nano"]["bottom"] + kept["push"]["bottom"]
+    assert times["small+push"]["bottom"] == plain["bottom"] + kept["push"]["bottom"]
 
 
 def test_every_rung_of_the_package_can_be_dressed():
