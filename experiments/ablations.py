@@ -28,6 +28,7 @@ from physxnet_jax.data import Sequence, list_sequences, read_sequence
 from physxnet_jax.evaluation import Method, network, skinning, vertex_error
 from physxnet_jax.files import whole_file
 from physxnet_jax.garment import TEMPLATES
+from physxnet_jax.io import save_predictor
 from physxnet_jax.models import Inputs, ModelConfig
 from physxnet_jax.training import TrainConfig, read_metrics, train, usable_garment
 
@@ -95,6 +96,7 @@ def main() -> None:
     parser.add_argument("--other", default="runs/blender", help="the protocol by another engine")
     parser.add_argument("--runs", default="runs/ablations", help="where the runs are kept")
     parser.add_argument("--only", nargs="+", default=())
+    parser.add_argument("--weights", action="store_true", help="leave them in the runs' folders")
     words = parser.parse_args()
     path = RESULTS / "ablations.json"
     rows = json.loads(path.read_text()) if path.is_file() else []
@@ -112,9 +114,12 @@ def main() -> None:
                 bars.console.print(f"{name}: {', '.join(short)} isn't built (whole); left out.")
                 continue
             engines = {s.meta[t]["engine"] for s in tests for t in s.offsets}
-            if all(any(r["variant"] == name and r["engine"] == e for r in rows) for e in engines):
-                continue
+            told = all(
+                any(r["variant"] == name and r["engine"] == e for r in rows) for e in engines
+            )
             folder = pathlib.Path(words.runs) / name.replace(" ", "_")
+            if told and not (words.weights and not (folder / "weights").is_dir()):
+                continue
             bar = bars.add_task(name)
             jax.clear_caches()
             predictor = train(
@@ -124,6 +129,10 @@ def main() -> None:
                 steps=steps(words.data, config),
                 report=lambda k, n, _, bar=bar: bars.update(bar, completed=k, total=n),
             )
+            if words.weights:
+                save_predictor(folder / "weights", predictor, name=folder.name)
+            if told:
+                continue
             log = [x for x in read_metrics(folder) if "loss" in x]
             rows = [r for r in rows if r["variant"] != name]
             rows += measure(name, network(predictor), tests)

@@ -95,6 +95,7 @@ def main() -> None:
         "cloth_memory",
         "previous_offset",
         "accuracy_cost",
+        "frames_seen",
         "peers",
         "engines",
         "training",
