@@ -95,8 +95,10 @@ def test_nothing_is_timed_twice_and_another_machine_is(tmp_path):
     known["machine"]["device"] = "abacus"
     path.write_text(json.dumps(known))
     assert calibrate(rungs, worn[:1], path=path, frames=17)["lbs"]["bottom"] != 123.0
-    path.write_text("{")
-    assert calibrate(rungs, worn[:1], path=path, frames=17)["lbs"]["bottom"] > 0
+    here = json.loads(path.read_text())
+    for broken in ("{", "[]", json.dumps({**here, "times": {"lbs": 1.0}})):
+        path.write_text(broken)
+        assert calibrate(rungs, worn[:1], path=path, frames=17)["lbs"]["bottom"] > 0
 
 
 def test_push_out_is_timed_once_for_all_networks(tmp_path):

@@ -263,4 +263,6 @@ def _read(path: pathlib.Path) -> dict[str, Any]:
         kept = json.loads(path.read_text())
     except (OSError, json.JSONDecodeError):
         return {}
-    return kept if isinstance(kept, dict) and isinstance(kept.get("times"), dict) else {}
+    times = kept.get("times") if isinstance(kept, dict) else None
+    whole = isinstance(times, dict) and all(isinstance(known, dict) for known in times.values())
+    return kept if whole else {}
