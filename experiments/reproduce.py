@@ -41,8 +41,9 @@ METHODS = (
         f"{n}{m}{p}"
         for n in ("nano", "small", "local", "pair")
         for m in ("", "+mirror")
-        for p in ("", "+push")
+        for p in ("", "+push", "+relax+push")
     ),
+    "local+relax",
     "local-muon",
     "local-muon+mirror",
     "paper",
@@ -96,6 +97,7 @@ def main() -> None:
         "previous_offset",
         "accuracy_cost",
         "frames_seen",
+        "relaxation",
         "peers",
         "engines",
         "training",

@@ -101,21 +101,24 @@ def test_nothing_is_timed_twice_and_another_machine_is(tmp_path):
         assert calibrate(rungs, worn[:1], path=path, frames=17)["lbs"]["bottom"] > 0
 
 
-def test_push_out_is_timed_once_for_all_networks(tmp_path):
-    rungs = [rung(n, 10.0) for n in ("nano", "nano+push", "small+push")]
+def test_what_follows_the_network_is_timed_once_for_all(tmp_path):
+    rungs = [rung(n, 10.0) for n in ("nano", "nano+push", "nano+relax+push", "small+relax+push")]
     path = tmp_path / "times.json"
     times = calibrate(rungs, [("bottom",)], path=path, frames=16)
     kept = json.loads(path.read_text())["times"]
-    plain = next(v for k, v in kept.items() if k.startswith("small "))
-    assert kept["push"]["bottom"] >= 0
-    assert times["nano+push"]["bottom"] == times["nano"]["bottom"] + kept["push"]["bottom"]
-    assert times["small+push"]["bottom"] == plain["bottom"] + kept["push"]["bottom"]
+    plain = next(v for k, v in kept.items() if k.startswith("small "))["bottom"]
+    push, relaxed = (kept[way]["bottom"] for way in ("+push", "+relax"))
+    assert push >= 0 and relaxed >= 0
+    assert times["nano+push"]["bottom"] == times["nano"]["bottom"] + push
+    assert times["nano+relax+push"]["bottom"] == times["nano"]["bottom"] + relaxed + push
+    assert times["small+relax+push"]["bottom"] == plain + relaxed + push
 
 
 def test_every_rung_of_the_package_can_be_dressed():
     ladder = load_ladder()
     names = {r.name for r in ladder}
-    assert {"lbs", "local", "local+push", "local+mirror", "local+mirror+push"} <= names
+    ways = ("", "+push", "+mirror", "+mirror+push")
+    assert {"lbs", *(f"local{way}" for way in ways)} <= names
     for r in ladder:
         assert set(r.rmse_mm) == set(r.inside) == set(TEMPLATES)
         assert r.name.partition("+")[0] in {"lbs", *list_weights(), *ACCURACY}

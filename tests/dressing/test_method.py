@@ -9,9 +9,12 @@ from physxnet_jax.body import load_body
 from physxnet_jax.data import mirrored_offsets
 from physxnet_jax.dressing import Rung, method_by_name
 from physxnet_jax.errors import MissingDependencyError, WeightsError
-from physxnet_jax.evaluation import ENGINES
+from physxnet_jax.evaluation import ENGINES, edge_strain
+from physxnet_jax.garment import template
 from physxnet_jax.io import load_predictor, read_card, weights_size
+from physxnet_jax.models import RELAXATION, relax_cloth
 from physxnet_jax.motion import Motion, load_motion, mirrored
+from physxnet_jax.simulation import Scene, prepare_scene
 
 
 def test_a_name_with_mirror_answers_the_mirrored_person_with_the_mirrored_cloth():
@@ -52,13 +55,33 @@ def test_an_engine_is_asked_as_any_other_way(monkeypatch):
         method_by_name("blender")(walk, "bottom")
 
 
+@pytest.mark.parametrize("name", ["top", "dress"])
+def test_a_name_with_relax_brings_edges_back_and_leaves_cloth_where_it_is(name):
+    punch = load_motion("punch", fps=30.0)
+    punch = Motion(punch.rotations[40:48], punch.root[40:48], punch.fps, punch.name)
+    assembly = prepare_scene(Scene((template(name),))).assembly
+    answers = {n: method_by_name(n)(punch, name).positions for n in ("nano", "nano+relax")}
+    before, after = (np.abs(edge_strain(assembly, x)) for x in answers.values())
+    # What is far from its length, the more so.
+    for share, most in ((0.5, 0.7), (0.9, 0.6), (0.99, 0.6)):
+        assert np.quantile(after, share) < most * np.quantile(before, share)
+    moved = np.linalg.norm(np.subtract(*answers.values()), axis=2)
+    assert 0.5e-3 < moved.mean() < 6e-3 and moved.max() < 0.06
+
+
 def test_the_card_is_that_of_the_weights():
-    assert read_card("nano+mirror") == read_card("nano")
-    assert weights_size("nano+mirror") == weights_size("nano")
+    for way in ("+mirror", "+relax", "+mirror+relax"):
+        assert read_card(f"nano{way}") == read_card("nano")
+        assert weights_size(f"nano{way}") == weights_size("nano")
     assert load_predictor("nano+mirror").mirrored and not load_predictor("nano").mirrored
-    options = Rung("nano+mirror+push", {}, {}).options
-    assert options == {"method": "network", "weights": "nano+mirror", "resolve": True}
-    identities = {Rung(n, {}, {}).identity for n in ("nano", "nano+mirror", "nano+mirror+push")}
-    assert len(identities) == 3
+    assert load_predictor("nano+relax").relaxation == RELAXATION
+    both = load_predictor("nano+relax+mirror")
+    assert both.mirrored and both.relaxation and not load_predictor("nano").relaxation
+    options = Rung("nano+mirror+relax+push", {}, {}).options
+    assert options == {"method": "network", "weights": "nano+mirror+relax", "resolve": True}
+    names = ("nano", "nano+mirror", "nano+relax", "nano+mirror+push")
+    assert len({Rung(n, {}, {}).identity for n in names}) == len(names)
+    with pytest.raises(ValueError, match="0 steps or more"):
+        relax_cloth(both, -1)
     with pytest.raises(WeightsError, match="No weights 'nana"):
         load_predictor("nana+mirror")

@@ -17,7 +17,7 @@ from rich.console import Console
 from physxnet_jax.cli import main, parse
 from physxnet_jax.cli._view import view
 from physxnet_jax.errors import FormatError, PhysXNetError
-from physxnet_jax.io import read_obj
+from physxnet_jax.io import read_obj, split_ways
 from physxnet_jax.motion import procedural_clip, save_motion
 
 pytest.importorskip("viser")
@@ -199,7 +199,7 @@ def test_live_clothes_are_what_the_page_shows_with_their_time(viewer):
     assert "nan" not in viewer._pace.content
     viewer._widgets["live"].value = False
     viewer._widgets["method"].value = "lbs"
-    viewer._widgets["weights"].value = SHORT.weights
+    viewer._widgets["weights"].value = split_ways(SHORT.weights)[0]
     assert viewer.wait().choice == SHORT and not viewer._pace.visible
     viewer._playing.value = True
 

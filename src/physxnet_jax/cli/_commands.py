@@ -51,8 +51,9 @@ class Dress:
     """The ASF of an AMC file, if it doesn't lie beside it."""
     joint_map: pathlib.Path | None = None
     """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
-    weights: str = "local"
-    """Name or folder of network weights; with +mirror the mirrored person is asked too."""
+    weights: str = "local+relax"
+    """Name or folder of network weights; with +mirror the mirrored person is asked too, with
+    +relax the cloth's edges are brought back to their lengths."""
     shape: tuple[str, ...] = ()
     """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
     body: bool = True
@@ -317,8 +318,8 @@ class View:
     """Templates (top, bottom, dress) and OBJ files."""
     method: Literal["network", "lbs", "simulate"] = "network"
     """network, lbs (skinning alone) or simulate."""
-    weights: str = "local"
-    """Name of network weights."""
+    weights: str = "local+relax"
+    """Name of network weights, as for dress."""
     compare: bool = False
     """Simulate the same clothes beside it and colour by the distance."""
     live: bool = False
@@ -371,8 +372,8 @@ class Export:
     """Folder for the function (StableHLO), triangles, a card and a loader."""
     wear: tuple[str, ...] = ("top", "bottom")
     """Garments: OBJ files or top, bottom, dress."""
-    weights: str = "local"
-    """Name or folder of network weights."""
+    weights: str = "local+relax"
+    """Name or folder of network weights, as for dress."""
     fps: float = 30.0
     """Frames a second that it will be asked for."""
     push_out: bool = True

@@ -3,6 +3,7 @@
 import collections
 import dataclasses
 import json
+import math
 import pathlib
 from collections.abc import Callable, Mapping, Sequence as Items
 
@@ -119,9 +120,12 @@ def _write(path: pathlib.Path, rows: list[ActionError]) -> None:
 
 
 def _rounded(row: ActionError) -> Mapping[str, object]:
+    # What earlier versions didn't measure is left out: NaN is no JSON.
+    optional = {f.name for f in dataclasses.fields(row) if f.default is not dataclasses.MISSING}
     return {
         k: float(f"{v:.5g}") if isinstance(v, float) else v
         for k, v in dataclasses.asdict(row).items()
+        if not (k in optional and math.isnan(v))
     }
 
 

@@ -6,12 +6,13 @@ from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import Body, load_body
 from ..errors import PhysXNetError
 from ..garment import Garment
-from ..geometry import Smoothing
+from ..geometry import Smoothing, make_springs
 from ..io import DEFAULT, AnimatedMesh, load_predictor
 from ..models import Predictor, Wearable, fold_batch_norm, make_surface, make_wearable
 from ..motion import (
@@ -274,13 +275,15 @@ def unbound_wearable(body: Body, rest: Float[Array, "all 3"], garment: Garment) 
     n = garment.num_vertices
     rows = Transference(jnp.zeros((n, 3), jnp.int32), jnp.zeros((n, 3)), jnp.zeros((n,), bool))
     none = Binding(rows, jnp.zeros((n, 4), jnp.int32), jnp.zeros((n, 4)), 1.0, 0, 0)
+    worn = garment.rest_vertices(rest)
     return Wearable(
-        garment.rest_vertices(rest),
+        worn,
         garment.skin,
         none,
-        garment.rest_vertices(rest),
+        worn,
         garment.skin,
         Smoothing(()),
+        make_springs(np.asarray(worn), np.asarray(garment.mesh.faces)),
         garment.template,
         garment.name,
     )

@@ -155,9 +155,12 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
         raise ValueError("dresses of the paper's family: use make_dresser(..., shape=shape).")
     rest = body.rest_vertices(shape)
     surface = dataclasses.replace(predictor.surface, rest=predictor.atlas.to_body @ rest)
+    worn = [g.rest_vertices(rest) for g in dresser.garments]
     wearables = tuple(
-        dataclasses.replace(w, rest=g.rest_vertices(rest), anchor=w.binding.to_body @ rest)
-        for w, g in zip(dresser.wearables, dresser.garments, strict=True)
+        dataclasses.replace(
+            w, rest=x, anchor=w.binding.to_body @ rest, springs=w.springs.at_rest(x)
+        )
+        for w, x in zip(dresser.wearables, worn, strict=True)
     )
     mesh = body.mesh(rest[:NUM_BODY_VERTICES])
     normals = vertex_normals(mesh.vertices, mesh.faces)

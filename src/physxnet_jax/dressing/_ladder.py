@@ -15,7 +15,7 @@ from .._environment import cache_folder
 from ..errors import PhysXNetError
 from ..files import whole_file
 from ..garment import TEMPLATES, Template
-from ..io import read_card
+from ..io import RELAX, read_card
 from ..motion import BLOCK, Motion, load_motion
 from ..simulation import ACCURACY
 from ._cost import clothing_cost
@@ -26,7 +26,7 @@ _FRAMES = 64
 # Calls of a network are timed for this long [s].
 _SECONDS = 0.5
 # What was timed in another way isn't taken.
-_TIMED = "garments together"
+_TIMED = "garments together, relaxed"
 ALONE_AND_TOGETHER: tuple[tuple[Template, ...], ...] = (*((t,) for t in TEMPLATES), TEMPLATES)
 """Each template alone, and all of them."""
 
@@ -36,8 +36,8 @@ class Rung:
     """A way to dress, with its error on the twelve test actions of the paper's protocol.
 
     Attributes:
-        name: ``lbs``, a name of weights, one with ``+mirror``, ``+push`` or both, or an
-            accuracy of the simulator.
+        name: ``lbs``, a name of weights, one with ``+mirror``, ``+relax``, ``+push`` or
+            several of them, or an accuracy of the simulator.
         rmse_mm: Root mean square distance of vertices from the simulation at its
             ``standard`` setting [mm], by template.
         inside: Share of vertices inside the body that have room outside, by template.
@@ -118,8 +118,8 @@ def calibrate(
 
     Returns:
         For each rung and `worn_key`, median milliseconds a frame after warm-up, from joint
-        rotations to vertices. Push-out, the same for every network, is timed with the first
-        one and added to the others.
+        rotations to vertices. Relaxation and push-out, the same for every network, are
+        timed with the first one and added to the others.
     """
     clock = _Clock(calibration_file() if path is None else path, frames)
     jobs = [(r, w) for r in rungs for w in worn if all(t in r.rmse_mm for t in w)]
@@ -155,20 +155,21 @@ class _Clock:
             # These dress a garment after another.
             method = method_by_name(rung.name)
             return sum(method(self._walk, t).ms_per_frame for t in templates)
-        name, push, _ = rung.name.partition("+push")
-        if not push:
-            return self._network(name, templates, resolve=False)
-        # All networks' vertices are pushed out alike: it is timed with the first one.
-        plain = self.time_of(dataclasses.replace(rung, name=name), templates)
-        known = self.times.setdefault("push", {})
+        # What follows the network is the same for all: it is timed with the first one.
+        last = next((w for w in ("+push", RELAX) if rung.name.endswith(w)), None)
+        if last is None:
+            return self._network(rung, templates)
+        shorter = dataclasses.replace(rung, name=rung.name.removesuffix(last))
+        plain = self.time_of(shorter, templates)
+        known = self.times.setdefault(last, {})
         key = worn_key(templates)
         if key not in known:
-            whole = self._network(name, templates, resolve=True)
-            self._keep(known, key, max(0.0, whole - plain))
+            self._keep(known, key, max(0.0, self._network(rung, templates) - plain))
         return plain + known[key]
 
-    def _network(self, name: str, templates: Sequence[Template], *, resolve: bool) -> float:
-        dresser = make_dresser(templates, weights=name, resolve=resolve)
+    def _network(self, rung: Rung, templates: Sequence[Template]) -> float:
+        options = rung.options
+        dresser = make_dresser(templates, weights=options["weights"], resolve=options["resolve"])
         return clothing_cost(dresser, self._walk, BLOCK, seconds=_SECONDS)["ms_per_frame"]
 
     def _keep(self, known: dict[str, float], key: str, ms: float) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Array
 from ..body import load_body
 from ..evaluation import ENGINES, NOISE, Blockwise, Method, Simulator, engine, network, skinning
 from ..garment import Template, template
-from ..io import MIRROR, load_predictor
+from ..io import load_predictor, split_ways
 from ..models import Predictor, Wearable, dress_frames
 from ..simulation import ACCURACY
 from ._push_out import SkinPatch, each_frame, make_patch, push_out
@@ -40,7 +40,8 @@ def method_by_name(name: str) -> Method:
     Args:
         name: A network is called by its weights' name or folder, or a run's folder; with
             ``+mirror`` behind it is asked for the mirrored person too (see
-            `ask_mirrored`), with ``+push`` behind all its vertices are pushed out of the
+            `ask_mirrored`), with ``+relax`` its cloth is brought back to its lengths (see
+            `relax_cloth`), with ``+push`` behind all its vertices are pushed out of the
             body.
 
     Raises:
@@ -60,9 +61,9 @@ def method_by_name(name: str) -> Method:
 
 def weights_folder(name: str) -> str:
     """Where a run keeps its weights; any other name as it is."""
-    run = pathlib.Path(name.removesuffix(MIRROR)) / "weights"
-    mirror = MIRROR if name.endswith(MIRROR) else ""
-    return f"{run}{mirror}" if run.is_dir() else name
+    plain, ways = split_ways(name)
+    run = pathlib.Path(plain) / "weights"
+    return "".join((str(run), *ways)) if run.is_dir() else name
 
 
 @functools.partial(jax.jit, static_argnames=("fps",))

@@ -39,6 +39,7 @@ from ._motion_metrics import (
     acceleration_error as acceleration_error,
     area_strain as area_strain,
     dihedral_angles as dihedral_angles,
+    fold_strength as fold_strength,
     jitter as jitter,
     wrinkle_error as wrinkle_error,
 )

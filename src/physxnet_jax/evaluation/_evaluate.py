@@ -1,6 +1,7 @@
 """The error of every action and template: the paper's two figures, and what they miss."""
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence as Items
 from typing import Any
 
@@ -15,7 +16,13 @@ from ..training import usable_garment
 from ..uv import Transference, garment_map_rows, make_atlas
 from ._methods import Method, skinning
 from ._metrics import vertex_error
-from ._motion_metrics import acceleration_error, area_strain, jitter, wrinkle_error
+from ._motion_metrics import (
+    acceleration_error,
+    area_strain,
+    fold_strength,
+    jitter,
+    wrinkle_error,
+)
 from ._penetration import penetration
 from ._strain import edge_strain
 
@@ -54,6 +61,8 @@ class ActionError:
         jitter_reference: That of the reference.
         finite_share: Share of frames that are finite; errors are over these.
         ms_per_frame: From joint rotations to this template's vertices, warm.
+        fold_strength: Over that of the reference, see there [1].
+        strain_p99_reference: ``strain_p99`` of the reference.
     """
 
     engine: str
@@ -79,6 +88,8 @@ class ActionError:
     jitter_reference: float
     finite_share: float
     ms_per_frame: float
+    fold_strength: float = math.nan
+    strain_p99_reference: float = math.nan
 
 
 def evaluate(
@@ -212,6 +223,8 @@ class _Reference:
                 np.quantile(np.abs(area_strain(assembly.rest, faces, x)), 0.99)
             ),
             "wrinkle_deg": wrinkle_error(faces, x, y),
+            "fold_strength": fold_strength(faces, x) / max(fold_strength(faces, y), 1e-6),
+            "strain_p99_reference": float(np.quantile(np.abs(edge_strain(assembly, y)), 0.99)),
         }
         # Across a frame that is missing there is no acceleration.
         if finite.all():

@@ -34,6 +34,17 @@ def wrinkle_error(
     return float(np.degrees(np.sqrt(np.mean(gap**2))))
 
 
+def fold_strength(
+    faces: Int[np.ndarray, "faces 3"], positions: Float[np.ndarray, "frames vertices 3"]
+) -> float:
+    """Root mean square of the angles at the folds [degrees], wherever these are.
+
+    `wrinkle_error` asks for the same folds in the same places, and is least where there are
+    none; this tells whether there are any.
+    """
+    return float(np.degrees(np.sqrt(np.mean(dihedral_angles(faces, positions) ** 2))))
+
+
 def area_strain(
     rest: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],

@@ -61,8 +61,9 @@ def error_tables(rows: Items[ActionError]) -> str:
 def _means(rows: Items[ActionError], engine: str) -> list[str]:
     lines = [
         "| method | template | RMSE vertices | MSE vertices, mm^2 | RMSE texels | inside, % |"
-        " pinched, % | strain 99 % | wrinkles, deg | jerk over reference | ms a frame |",
-        "|---|---|---|---|---|---|---|---|---|---|---|",
+        " pinched, % | strain 99 % | of reference | wrinkles, deg | folds over reference |"
+        " jerk over reference | ms a frame |",
+        "|" + "---|" * 13,
     ]
     for method in dict.fromkeys(r.method for r in rows):
         for name in dict.fromkeys(r.template for r in rows):
@@ -73,10 +74,15 @@ def _means(rows: Items[ActionError], engine: str) -> list[str]:
                 f"| {method} | {name} | {m['rmse_vertices_mm']:.1f} | {m['mse_vertices_mm2']:.0f}"
                 f" | {m['rmse_texels_mm']:.1f} | {100 * m['penetration_share']:.2f}"
                 f" | {100 * m['pinched_share']:.2f} | {m['strain_p99']:.2f}"
-                f" | {m['wrinkle_deg']:.1f} | {_share(m['jitter'], m['jitter_reference'])}"
+                f" | {_known(m['strain_p99_reference'])} | {m['wrinkle_deg']:.1f}"
+                f" | {_known(m['fold_strength'])} | {_share(m['jitter'], m['jitter_reference'])}"
                 f" | {m['ms_per_frame']:.1f} |"
             )
     return lines
+
+
+def _known(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.2f}"
 
 
 def _share(part: float, whole: float) -> str:

@@ -23,6 +23,7 @@ from ._rotation import (
     safe_norm as safe_norm,
     safe_normalize as safe_normalize,
 )
+from ._springs import Springs as Springs, make_springs as make_springs, relax as relax
 from ._stencil import (
     Smoothing as Smoothing,
     Stencil as Stencil,

@@ -42,7 +42,7 @@ def _mesh_edges(faces: bytes) -> Edges:
     inverse = inverse.reshape(-1)
     order = np.argsort(inverse, kind="stable")
     count = np.bincount(inverse, minlength=len(unique))
-    start = np.concatenate([[0], np.cumsum(count)[:-1]])
+    start = np.cumsum(count) - count
     beside = np.full((len(unique), 2), -1, dtype=np.int64)
     beside[:, 0] = order[start] // 3
     two = count >= 2

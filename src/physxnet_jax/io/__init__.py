@@ -22,11 +22,13 @@ from ._usd import write_usd as write_usd
 from ._weights import (
     DEFAULT as DEFAULT,
     MIRROR as MIRROR,
+    RELAX as RELAX,
     list_weights as list_weights,
     load_predictor as load_predictor,
     read_card as read_card,
     save_mean as save_mean,
     save_predictor as save_predictor,
+    split_ways as split_ways,
     weights_size as weights_size,
 )
 from ._write import EXTENSIONS as EXTENSIONS, check_output as check_output, write_clip as write_clip

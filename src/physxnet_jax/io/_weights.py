@@ -27,12 +27,16 @@ from ..models import (
     average_networks,
     make_generator,
     make_surface,
+    relax_cloth,
 )
 from ..uv import make_atlas
 
-DEFAULT = "local"
+DEFAULT = "local+relax"
 MIRROR = "+mirror"
 """Behind the name of weights: the network is asked for the mirrored person too."""
+RELAX = "+relax"
+"""Behind the name of weights: cloth is brought back to the lengths of its edges."""
+_WAYS = {MIRROR: ask_mirrored, RELAX: relax_cloth}
 _TENSORS, _CARD = "weights.safetensors", "card.json"
 _PACKAGED = pathlib.Path(str(importlib.resources.files(__package__ or "") / "weights"))
 
@@ -54,8 +58,9 @@ def save_predictor(
 
     Raises:
         WeightsError: A predictor that couldn't be read again: its network is a mean, its
-            batch norm is folded, or it asks for the mirrored person (save it without, and
-            call the weights with ``+mirror``). Or parameters beyond half precision.
+            batch norm is folded, it asks for the mirrored person or relaxes cloth (save
+            it without, and call the weights with ``+mirror`` or ``+relax``). Or
+            parameters beyond half precision.
     """
     folder = pathlib.Path(folder)
     network = nnx.merge(predictor.graph, predictor.state)
@@ -67,10 +72,10 @@ def save_predictor(
             f"{name}: this network has been folded or is none of make_generator's; save the"
             " predictor that was trained or loaded."
         )
-    if predictor.mirrored:
+    if predictor.mirrored or predictor.relaxation:
         raise WeightsError(
-            f"{name}: a predictor that asks for the mirrored person is saved without that; name"
-            " the weights with +mirror when they are loaded."
+            f"{name}: a predictor that asks for the mirrored person or relaxes cloth is saved"
+            f" without that; name the weights with {MIRROR} or {RELAX} when they are loaded."
         )
     tensors: dict[str, np.ndarray] = {}
     for k, (path, x) in enumerate(jax.tree_util.tree_leaves_with_path(predictor.state)):
@@ -158,7 +163,7 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
 
     Args:
         weights: A name of `list_weights`, or a folder that `save_predictor` wrote. With
-            ``+mirror`` behind it, see `ask_mirrored`.
+            ``+mirror`` behind it, see `ask_mirrored`; with ``+relax``, see `relax_cloth`.
 
     Returns:
         The predictor, on the built-in body's default shape.
@@ -178,12 +183,25 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
             f"{weights}: the card or the tensors are damaged ({type(error).__name__}:"
             f" {str(error)[:200]}). Reinstall or copy them again."
         ) from error
-    if not str(weights).endswith(MIRROR):
-        return predictor
     try:
-        return ask_mirrored(predictor)
+        for way in split_ways(weights)[1]:
+            predictor = _WAYS[way](predictor)
     except ValueError as error:
         raise WeightsError(f"{weights}: {error}") from None
+    return predictor
+
+
+def split_ways(weights: str | pathlib.Path) -> tuple[str, tuple[str, ...]]:
+    """The name or folder of weights, and the ways behind it in which they are used.
+
+    >>> split_ways("local+mirror+relax")
+    ('local', ('+mirror', '+relax'))
+    """
+    name, ways = str(weights), []
+    while way := next((w for w in _WAYS if name.endswith(w) and w not in ways), None):
+        name = name.removesuffix(way)
+        ways.insert(0, way)
+    return name, tuple(ways)
 
 
 def _model(card: dict[str, Any]) -> ModelConfig:
@@ -258,7 +276,7 @@ def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
 
 
 def _folder(weights: str | pathlib.Path) -> pathlib.Path:
-    name = str(weights).removesuffix(MIRROR)
+    name, _ = split_ways(weights)
     path = pathlib.Path(name)
     if (path / _CARD).is_file():
         return path

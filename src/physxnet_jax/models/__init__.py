@@ -17,6 +17,7 @@ from ._fold import at_precision as at_precision, fold_batch_norm as fold_batch_n
 from ._mean import MeanGenerator as MeanGenerator, average_networks as average_networks
 from ._networks import Discriminator as Discriminator, Generator as Generator
 from ._predictor import (
+    RELAXATION as RELAXATION,
     ModelConfig as ModelConfig,
     Normalisation as Normalisation,
     Predictor as Predictor,
@@ -31,6 +32,7 @@ from ._predictor import (
     normalise as normalise,
     pad_clip as pad_clip,
     pose_windows as pose_windows,
+    relax_cloth as relax_cloth,
     skin_wearable as skin_wearable,
 )
 from ._stream import (

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..geometry import relax
 from ..typing import pytree
 from ._features import point_features, skin_points
 from ._predictor import Predictor, Wearable, normalise, place_sampled
@@ -76,10 +77,9 @@ def stream_frame(
     features = normalise(features, predictor.normalisation, inputs)
     templates = tuple(dict.fromkeys(w.template for w in wearables))
     offsets = predictor.from_features(features, templates)
-    worn = tuple(
-        place_sampled(
-            w, rotations, translations, w.sample(offsets[w.template][0]), predictor.config.family
-        )
-        for w in wearables
-    )
-    return Stream(window[1:]), worn
+    worn = []
+    for w in wearables:
+        sampled = w.sample(offsets[w.template][0])
+        x = place_sampled(w, rotations, translations, sampled, predictor.config.family)
+        worn.append(relax(w.springs, x, predictor.relaxation))
+    return Stream(window[1:]), tuple(worn)

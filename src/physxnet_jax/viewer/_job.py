@@ -33,7 +33,7 @@ class Choice:
         motion: A built-in clip or a motion file.
         wear: Templates and OBJ files.
         method: ``network``, ``lbs`` or ``simulate``.
-        weights: Which network.
+        weights: Which network, and the ways behind its name (see `load_predictor`).
         push_out: Push vertices that end inside the body onto it.
         compare: Simulate the same clothes beside it, and colour by the distance.
         live: Ask the network for each frame in the moment it is shown, and tell what that

@@ -21,7 +21,15 @@ from ..dressing import METHODS
 from ..errors import FormatError, PhysXNetError
 from ..files import whole_file
 from ..garment import FABRICS, TEMPLATES
-from ..io import EXTENSIONS, GARMENT_FORMATS, list_weights, write_clip
+from ..io import (
+    EXTENSIONS,
+    GARMENT_FORMATS,
+    MIRROR,
+    RELAX,
+    list_weights,
+    split_ways,
+    write_clip,
+)
 from ..motion import CLIPS, GltfFile
 from ..simulation import ACCURACY
 from ._job import Choice, Shown, carry_out, check_choice
@@ -103,7 +111,7 @@ class Viewer:
                 str(self._files.get(name, name)) for name, box in self._worn.items() if box.value
             ),
             method=w["method"].value,
-            weights=w["weights"].value,
+            weights="".join((w["weights"].value, *(x for x in (MIRROR, RELAX) if w[x].value))),
             push_out=w["push_out"].value,
             compare=w["compare"].value,
             live=w["live"].value,
@@ -236,11 +244,12 @@ class Viewer:
                 self._add_garment(short, name in choice.wear)
         with gui.add_folder("Cloth"):
             w["method"] = gui.add_dropdown("method", METHODS, initial_value=choice.method)
+            name, ways = split_ways(choice.weights)
             w["weights"] = gui.add_dropdown(
-                "network",
-                tuple(dict.fromkeys((*list_weights(), choice.weights))),
-                initial_value=choice.weights,
+                "network", tuple(dict.fromkeys((*list_weights(), name))), initial_value=name
             )
+            w[MIRROR] = gui.add_checkbox("ask for the mirrored person too", MIRROR in ways)
+            w[RELAX] = gui.add_checkbox("edges back to their lengths", RELAX in ways)
             w["push_out"] = gui.add_checkbox("push out of the body", choice.push_out)
             w["compare"] = gui.add_checkbox("simulation beside it", choice.compare)
             w["live"] = gui.add_checkbox("clothe live, as it plays", choice.live)
