@@ -23,7 +23,7 @@ _CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach
 
 
 def main() -> None:
-    choice = Choice("walk", ("top", "bottom"), weights="small", frames=60, live=True)
+    choice = Choice("walk", ("top", "bottom"), weights="small+relax", frames=60, live=True)
     viewer = Viewer(choice)
     viewer.wait()
     viewer._playing.value = False

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from physxnet_jax.cli import main
-from physxnet_jax.dressing import load_scene, make_scene
+from physxnet_jax.dressing import load_scene, make_dresser, make_scene
 from physxnet_jax.errors import (
     FormatError,
     MissingDependencyError,
@@ -103,6 +103,9 @@ def test_what_dress_tells_of_a_garment_file_is_told_here_too(tmp_path, capsys):
     assert main(["simulate", str(scene), "--frames", "2", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["notes"] == [note]
     assert not make_scene("walk", ["bottom"]).notes
+    (told,) = make_dresser([f"{tmp_path / 'caught.obj'}=bottom"], weights="nano").notes
+    assert told == note
+    assert not make_dresser(["bottom"], weights="nano").notes
 
 
 def test_a_folder_of_other_things_is_neither_used_nor_removed(tmp_path):

@@ -127,6 +127,7 @@ def test_an_export_runs_without_this_package(dresser, whole, motion, tmp_path):
     assert all(f.is_file() for f in files)
     card = json.loads((tmp_path / "out" / "card.json").read_text())
     assert card["garments"] == {"bottom": 2726} and card["weights"]["name"] == "local"
+    assert card["relaxation_steps"] == 8 and not card["asked_mirrored"] and card["push_out"]
     assert card["platforms"] == ["cpu", "cuda"], "lowered for both, wherever it is written"
     faces = np.load(tmp_path / "out" / "garments.npz")["bottom_faces"]
     assert faces.max() == 2725

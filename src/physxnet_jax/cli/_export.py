@@ -19,8 +19,10 @@ def export(command: Export, console: Console) -> int:
             name=command.weights,
         )
     if command.json:
-        print_json({"files": files})
+        print_json({"files": files, "notes": dresser.notes})
         return 0
+    for note in dresser.notes:
+        console.print(note, highlight=False, soft_wrap=True)
     for file in files:
         console.print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)", highlight=False)
     console.print(

@@ -47,6 +47,7 @@ class Dresser:
         layers: Which garments lie over which, innermost first.
         garments: The same at rest on the body's default shape, and what carries them.
         resolve: Whether vertices inside the body are moved out of it.
+        notes: What the reader should know about the garments' files.
     """
 
     body: Body
@@ -57,6 +58,7 @@ class Dresser:
     layers: tuple[Layer, ...]
     garments: tuple[Garment, ...]
     resolve: bool = dataclasses.field(metadata={"static": True})
+    notes: tuple[str, ...] = dataclasses.field(default=(), metadata={"static": True})
 
     @property
     def faces(self) -> tuple[Int[Array, "faces 3"], ...]:
@@ -115,7 +117,7 @@ def make_dresser(
     """
     body = load_body() if body is None else body
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
-    garments, _ = worn_garments(wear, body)
+    garments, notes = worn_garments(wear, body)
     garments = [as_on(body, g) for g in garments]
     predictor = weights if isinstance(weights, Predictor) else load_predictor(weights)
     predictor = at_precision(fit_surface(predictor, body, rest, shape), precision)
@@ -125,7 +127,9 @@ def make_dresser(
         wearables,
     )
     layers = make_layers(body, rest, wearables, garments)
-    return Dresser(body, rest, predictor, wearables, patches, layers, tuple(garments), resolve)
+    return Dresser(
+        body, rest, predictor, wearables, patches, layers, tuple(garments), resolve, notes
+    )
 
 
 def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:

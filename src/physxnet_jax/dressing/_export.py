@@ -106,6 +106,8 @@ def export_dresser(
         "root": "position of the first joint, metres, Y up, [frames, 3]",
         "garments": {w.name: int(w.rest.shape[0]) for w in dresser.wearables},
         "push_out": dresser.resolve,
+        "asked_mirrored": dresser.predictor.mirrored,
+        "relaxation_steps": dresser.predictor.relaxation,
         "weights": {k: v for k, v in read_card(name).items() if k != "measured"} if name else {},
         **CARD,
     }

@@ -248,8 +248,8 @@ class Viewer:
             w["weights"] = gui.add_dropdown(
                 "network", tuple(dict.fromkeys((*list_weights(), name))), initial_value=name
             )
-            w[MIRROR] = gui.add_checkbox("ask for the mirrored person too", MIRROR in ways)
-            w[RELAX] = gui.add_checkbox("edges back to their lengths", RELAX in ways)
+            w[MIRROR] = gui.add_checkbox("mirrored person too", MIRROR in ways)
+            w[RELAX] = gui.add_checkbox("lengths of edges", RELAX in ways)
             w["push_out"] = gui.add_checkbox("push out of the body", choice.push_out)
             w["compare"] = gui.add_checkbox("simulation beside it", choice.compare)
             w["live"] = gui.add_checkbox("clothe live, as it plays", choice.live)
