@@ -22,21 +22,23 @@ from ._predictor import (
     Normalisation as Normalisation,
     Predictor as Predictor,
     Surface as Surface,
-    Wearable as Wearable,
-    apply_offsets as apply_offsets,
     ask_mirrored as ask_mirrored,
-    dress_frames as dress_frames,
     make_generator as make_generator,
     make_surface as make_surface,
-    make_wearable as make_wearable,
     normalise as normalise,
-    pad_clip as pad_clip,
-    pose_windows as pose_windows,
     relax_cloth as relax_cloth,
-    skin_wearable as skin_wearable,
 )
 from ._stream import (
     Stream as Stream,
     start_stream as start_stream,
     stream_frame as stream_frame,
+)
+from ._wearable import (
+    Wearable as Wearable,
+    apply_offsets as apply_offsets,
+    dress_frames as dress_frames,
+    make_wearable as make_wearable,
+    pad_clip as pad_clip,
+    pose_windows as pose_windows,
+    skin_wearable as skin_wearable,
 )

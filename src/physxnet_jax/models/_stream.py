@@ -9,7 +9,8 @@ from jaxtyping import Array, Float
 from ..geometry import relax
 from ..typing import pytree
 from ._features import point_features, skin_points
-from ._predictor import Predictor, Wearable, normalise, place_sampled
+from ._predictor import Predictor, normalise
+from ._wearable import Wearable, place_sampled
 
 
 @pytree
