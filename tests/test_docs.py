@@ -101,7 +101,14 @@ def test_costs_are_the_measured_ones():
     own = (ROOT / "docs/own-body.md").read_text()
     assert (ROOT / "experiments/results/own_bodies.md").read_text() in own
     assert (ROOT / "experiments/results/foreign_character.md").read_text() in own
-    for name in ("accuracy_cost", "frames_seen", "peers", "engines", "training"):
+    for name in (
+        "accuracy_cost",
+        "frames_seen",
+        "relaxation",
+        "peers",
+        "engines",
+        "training",
+    ):
         block = re.search(rf"<!-- begin {name} -->\n(.*?)<!-- end {name} -->", text, re.S)
         assert block and block.group(1) == (ROOT / f"experiments/results/{name}.md").read_text()
     rows = json.loads((ROOT / "experiments/results/accuracy_cost.json").read_text())["rows"]

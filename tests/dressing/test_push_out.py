@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from physxnet_jax.dressing import (
-    each_frame,
     make_patch,
     push_out,
     skin_height,
@@ -17,6 +16,7 @@ from physxnet_jax.dressing import (
     unbound_wearable,
 )
 from physxnet_jax.garment import template
+from physxnet_jax.geometry import each_frame
 from physxnet_jax.models import skin_wearable
 from physxnet_jax.motion import clip_transforms, load_motion
 

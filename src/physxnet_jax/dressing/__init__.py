@@ -50,7 +50,6 @@ from ._method import (
 )
 from ._push_out import (
     SkinPatch as SkinPatch,
-    each_frame as each_frame,
     make_patch as make_patch,
     push_out as push_out,
     skin_height as skin_height,

@@ -12,11 +12,12 @@ from jaxtyping import Array, Float
 
 from ..body import Body
 from ..garment import Garment
+from ..geometry import each_frame
 from ..models import Predictor, Wearable, dress_frames, skin_wearable
 from ..motion import BLOCK, Motion, padded_block
 from ..simulation import ACCURACY, Scene, prepare_scene, simulate_batch, standard_effects
 from ._layers import Layer, inside_out, lift_layers
-from ._push_out import SkinPatch, each_frame, push_out, skin_height
+from ._push_out import SkinPatch, push_out, skin_height
 from ._stages import Stage
 
 

@@ -13,10 +13,11 @@ from scipy.spatial import KDTree
 from ..body import Body, clothed_vertices, load_body, register_body
 from ..errors import MeshError
 from ..garment import Garment
+from ..geometry import each_frame
 from ..io import AnimatedMesh, read_character, smooth_normals
 from ..models import Wearable, skin_points
 from ..motion import BLOCK, Motion, body_animation, follow_surface, padded_block
-from ._push_out import SkinPatch, each_frame, push_out_of
+from ._push_out import SkinPatch, push_out_of
 
 # Skin whose leftover movement a garment vertex takes over: so many vertices, over so far [m].
 _SKIN, _WIDTH = 24, 0.03

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..garment import Garment
-from ..geometry import vertex_normals
+from ..geometry import each_frame, vertex_normals
 from ..io import DEFAULT, load_predictor
 from ..models import (
     Predictor,
@@ -28,7 +28,7 @@ from ..typing import pytree
 from ._dress import as_on, bound_wearable, fit_surface
 from ._layers import Layer, lift_layers, lift_off, make_layers
 from ._meshes import worn_garments
-from ._push_out import SkinPatch, each_frame, make_patch, push_out, tuck_in
+from ._push_out import SkinPatch, make_patch, push_out, tuck_in
 
 Precision = Literal["float32", "bfloat16"]
 

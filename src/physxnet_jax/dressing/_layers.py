@@ -11,10 +11,10 @@ from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body
 from ..garment import Garment
-from ..geometry import Smoothing, gaussian_smoothing, vertex_normals
+from ..geometry import Smoothing, each_frame, gaussian_smoothing, vertex_normals
 from ..models import Wearable
 from ..typing import pytree
-from ._push_out import each_frame, least_height
+from ._push_out import least_height
 from ._skirt import skin_foot
 
 _Worn = TypeVar("_Worn", Garment, Wearable)

@@ -9,10 +9,11 @@ from jaxtyping import Array
 from ..body import load_body
 from ..evaluation import ENGINES, NOISE, Blockwise, Method, Simulator, engine, network, skinning
 from ..garment import Template, template
+from ..geometry import each_frame
 from ..io import load_predictor, split_ways
 from ..models import Predictor, Wearable, dress_frames
 from ..simulation import ACCURACY
-from ._push_out import SkinPatch, each_frame, make_patch, push_out
+from ._push_out import SkinPatch, make_patch, push_out
 
 _Worn = tuple[Predictor, Wearable, SkinPatch]
 

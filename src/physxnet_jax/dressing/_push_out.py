@@ -1,13 +1,11 @@
 """The last touch: vertices that a prediction left inside the body move onto it."""
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Sequence
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, Shaped
+from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body, blend_rotations
@@ -22,8 +20,6 @@ from ..geometry import (
 from ..models import Wearable, skin_points
 from ..typing import pytree
 from ._skirt import SkirtPatch, make_skirt_patch, skin_foot, skirt_lift, skirt_meeting
-
-_Result = TypeVar("_Result")
 
 # Triangles compared for each vertex: a patch of about five centimetres.
 _PATCH = 20
@@ -271,21 +267,3 @@ def _cleared(
         return points + move
     points = points + patch.carry @ move
     return points + _clearance(patch, points, posed, rotations)[1]
-
-
-def each_frame(function: Callable[..., _Result], *frames: Shaped[Array, "frames ..."]) -> _Result:
-    """A function of one frame applied to each, differentiable.
-
-    CPUs take one frame after the other: what lies between fits their caches. A gradient
-    computes that anew instead of keeping it.
-
-    Args:
-        function: Of one frame of each array.
-        frames: Arrays of frames.
-    """
-    one = jax.checkpoint(function)
-    return jax.lax.platform_dependent(
-        *frames,
-        cpu=lambda *arrays: jax.lax.map(lambda frame: one(*frame), arrays),
-        default=jax.vmap(one),
-    )

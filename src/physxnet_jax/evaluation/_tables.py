@@ -10,13 +10,14 @@ def summary_table(rows: Items[ActionError]) -> str:
     """One line a method: mean RMSE over actions for each template, what it costs.
 
     ``better than lbs`` counts the pairs of action and template in which a method's RMSE
-    over vertices is below that of skinning.
+    over vertices is below that of skinning; ``strain 99 %`` is how far one edge in a
+    hundred is from its length, over that length.
     """
     names = list(dict.fromkeys(r.template for r in rows))
     lines = [
         "| reference | method | " + " | ".join(f"{n}, mm" for n in names) + " | better than lbs |"
-        " inside, % | ms a frame and garment |",
-        "|---" * (len(names) + 5) + "|",
+        " inside, % | strain 99 % | ms a frame and garment |",
+        "|---" * (len(names) + 6) + "|",
     ]
     for engine in dict.fromkeys(r.engine for r in rows):
         plain = {
@@ -32,10 +33,11 @@ def summary_table(rows: Items[ActionError]) -> str:
             known = [(a, b) for a, b in pairs if b is not None]
             wins = "" if method == "lbs" else f"{sum(a < b for a, b in known)} of {len(known)}"
             inside = 100 * sum(r.penetration_share for r in mine) / len(mine)
+            strain = sum(r.strain_p99 for r in mine) / len(mine)
             ms = sum(r.ms_per_frame for r in mine) / len(mine)
             lines.append(
                 f"| {engine} | {method} | " + " | ".join(cells) + f" | {wins} | {inside:.2f}"
-                f" | {ms:.1f} |"
+                f" | {strain:.2f} | {ms:.1f} |"
             )
     return "\n".join(lines) + "\n"
 

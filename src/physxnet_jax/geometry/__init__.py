@@ -10,6 +10,7 @@ from ._closest import (
     least_index as least_index,
     signed_distance as signed_distance,
 )
+from ._frames import each_frame as each_frame
 from ._intersect import self_intersections as self_intersections
 from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
 from ._normals import face_normals as face_normals, vertex_normals as vertex_normals

@@ -33,28 +33,29 @@ class Springs:
         order: Rows, the groups one after the other, shape [rows].
         back: Where each row is in that order, shape [rows].
         index: Of each group, what its members are tied to, in that order, shape
-            [members, k]; themselves where they have fewer.
-        weight: How much each tie counts, at most about 0.6 in all, shape [members, k].
-        length: Length at rest [m], shape [members, k].
+            [k, members]; themselves where they have fewer.
+        weight: How much each tie counts, at most about 0.6 in all, shape [k, members].
+        length: Length at rest [m], shape [k, members].
     """
 
     order: Int[Array, " rows"]
     back: Int[Array, " rows"]
-    index: tuple[Int[Array, "members k"], ...]
-    weight: tuple[Float[Array, "members k"], ...]
-    length: tuple[Float[Array, "members k"], ...]
+    index: tuple[Int[Array, "k members"], ...]
+    weight: tuple[Float[Array, "k members"], ...]
+    length: tuple[Float[Array, "k members"], ...]
 
     def at_rest(self, points: Float[Array, "rows 3"]) -> "Springs":
         """The same springs with the lengths they have between these points [m]; pure."""
         rows = points[self.order]
-        starts = np.cumsum([0, *map(len, self.index[:-1])]).tolist()
-        return dataclasses.replace(
-            self,
-            length=tuple(
-                safe_norm(rows[i] - rows[start : start + len(i), None])
-                for start, i in zip(starts, self.index, strict=True)
-            ),
-        )
+        lengths = []
+        for start, index in zip(self.starts, self.index, strict=True):
+            lengths.append(safe_norm(rows[index] - rows[None, start : start + index.shape[1]]))
+        return dataclasses.replace(self, length=tuple(lengths))
+
+    @property
+    def starts(self) -> list[int]:
+        """Where each group begins in the order of rows."""
+        return np.cumsum([0, *(i.shape[1] for i in self.index[:-1])]).tolist()
 
 
 def make_springs(
@@ -88,13 +89,13 @@ def make_springs(
     index, weight, length = [], [], []
     for start, stop in _groups(degree[order]):
         members = order[start:stop]
-        slot = np.arange(max(int(degree[members].max(initial=0)), 1))
-        taken = slot < degree[members, None]
-        entry = np.where(taken, ties.indptr[members, None] + slot, 0)
-        here = np.arange(start, stop, dtype=np.int32)[:, None]
+        slot = np.arange(max(int(degree[members].max(initial=0)), 1))[:, None]
+        taken = slot < degree[members]
+        entry = np.where(taken, ties.indptr[members] + slot, 0)
+        here = np.arange(start, stop, dtype=np.int32)
         index.append(np.where(taken, back[_at(ties.indices, entry)], here).astype(np.int32))
         weight.append(np.where(taken, _at(ties.data, entry), 0.0).astype(np.float32))
-        away = vertices[order[index[-1]]] - vertices[members][:, None]
+        away = vertices[order[index[-1]]] - vertices[members]
         length.append(np.linalg.norm(away, axis=2).astype(np.float32))
     return Springs(
         jnp.asarray(order),
@@ -137,9 +138,7 @@ def _groups(degree: Int[np.ndarray, " rows"]) -> list[tuple[int, int]]:
     return [(0, cut), (cut, count)]
 
 
-def relax(
-    springs: Springs, points: Float[Array, "*batch rows 3"], steps: int
-) -> Float[Array, "*batch rows 3"]:
+def relax(springs: Springs, points: Float[Array, "rows 3"], steps: int) -> Float[Array, "rows 3"]:
     """Points moved towards the lengths of their springs; pure, differentiable.
 
     What is stretched draws together, what is pressed together folds. Few steps mend
@@ -169,44 +168,35 @@ def relax(
     """
     if steps == 0:
         return points
-    # Rows of a batch lie side by side: they are gathered as a whole.
-    rows = jnp.moveaxis(points.reshape(-1, *points.shape[-2:]), 0, -1)[springs.order]
+    rows = points[springs.order]
 
     def step(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         last, before = carry
         ahead = last + _MOMENTUM * (last - before)
-        moved = jnp.concatenate(
-            [
-                _pull(ahead, start, *group)
-                for start, *group in zip(
-                    np.cumsum([0, *map(len, springs.index[:-1])]).tolist(),
-                    springs.index,
-                    springs.weight,
-                    springs.length,
-                    strict=True,
-                )
-            ]
-        )
-        return (moved, last), None
+        groups = zip(springs.starts, springs.index, springs.weight, springs.length, strict=True)
+        return (jnp.concatenate([_pull(ahead, *group) for group in groups]), last), None
 
+    # A gradient computes the inside of a step anew.
     (rows, _), _ = jax.lax.scan(jax.checkpoint(step), (rows, rows), None, length=steps)
-    return jnp.moveaxis(rows[springs.back], -1, 0).reshape(points.shape)
+    return rows[springs.back]
 
 
 def _pull(
-    rows: Float[Array, "rows 3 batch"],
+    rows: Float[Array, "rows 3"],
     start: int,
-    index: Int[Array, "members k"],
-    weight: Float[Array, "members k"],
-    length: Float[Array, "members k"],
-) -> Float[Array, "members 3 batch"]:
-    mine = rows[start : start + len(index)]
-    out = mine
-    for k in range(index.shape[1]):
-        away = rows[index[:, k]] - mine
+    index: Int[Array, "k members"],
+    weight: Float[Array, "k members"],
+    length: Float[Array, "k members"],
+) -> Float[Array, "members 3"]:
+    mine = rows[start : start + index.shape[1]]
+
+    def tie(out: Array, known: tuple[Array, Array, Array]) -> tuple[Array, None]:
+        other, share, rest = known
+        away = rows[other] - mine
         squared = jnp.sum(away * away, axis=1)
-        rest = length[:, k, None]
         least = (_SHORTEST * rest) ** 2 + 1e-20
-        share = weight[:, k, None] * (1.0 - rest * jax.lax.rsqrt(jnp.maximum(squared, least)))
-        out = out + share[:, None] * away
-    return out
+        pull = share * (1.0 - rest * jax.lax.rsqrt(jnp.maximum(squared, least)))
+        return out + pull[:, None] * away, None
+
+    # A loop: written out it takes three times as long to compile, and no less to run.
+    return jax.lax.scan(tie, mine, (index, weight, length))[0]

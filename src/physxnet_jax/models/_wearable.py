@@ -13,6 +13,7 @@ from ..garment import Garment
 from ..geometry import (
     Smoothing,
     Springs,
+    each_frame,
     gaussian_smoothing,
     make_springs,
     polar_rotation,
@@ -174,8 +175,11 @@ def dress_frames(
         )
         for w in wearables
     )
+    if not predictor.relaxation:
+        return tuple(placed)
     return tuple(
-        relax(w.springs, x, predictor.relaxation) for w, x in zip(wearables, placed, strict=True)
+        each_frame(lambda x, s=w.springs: relax(s, x, predictor.relaxation), x)
+        for w, x in zip(wearables, placed, strict=True)
     )
 
 
