@@ -117,7 +117,7 @@ def test_what_follows_the_network_is_timed_once_for_all(tmp_path):
 def test_every_rung_of_the_package_can_be_dressed():
     ladder = load_ladder()
     names = {r.name for r in ladder}
-    ways = ("", "+push", "+mirror", "+mirror+push")
+    ways = ("", "+push", "+mirror", "+mirror+push", "+relax+push", "+mirror+relax+push")
     assert {"lbs", *(f"local{way}" for way in ways)} <= names
     for r in ladder:
         assert set(r.rmse_mm) == set(r.inside) == set(TEMPLATES)
