@@ -1,7 +1,7 @@
 """What bringing cloth back to its lengths is worth, step by step, and what it costs.
 
 Command: python experiments/relaxation.py --data runs/ours
-Cost:    ten minutes on two cores.
+Cost:    17 minutes beside other work on two cores.
 Result:  experiments/results/relaxation.md, shown in docs/accuracy-cost.md: means over the
          twelve test actions and three templates.
 

@@ -116,6 +116,7 @@ def main() -> None:
         "accuracy_cost",
         "frames_seen",
         "relaxation",
+        "relaxed_cost",
         "peers",
         "engines",
         "training",

@@ -105,6 +105,7 @@ def test_costs_are_the_measured_ones():
         "accuracy_cost",
         "frames_seen",
         "relaxation",
+        "relaxed_cost",
         "peers",
         "engines",
         "training",
