@@ -236,8 +236,8 @@ def relax_cloth(predictor: Predictor, steps: int = RELAXATION) -> Predictor:
     """A predictor whose cloth is brought back to the lengths of its edges.
 
     A network says where cloth is, to about a texel; edges come out up to half as long
-    again, and folds are lost. Few steps of `relax` mend that, and bring it nearer to the
-    simulation as well.
+    again, and folds are lost. Few steps of `relax` mend that, and move the cloth as a
+    whole by next to nothing.
 
     Args:
         predictor: Any predictor.
