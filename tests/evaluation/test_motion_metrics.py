@@ -7,6 +7,7 @@ from physxnet_jax.evaluation import (
     acceleration_error,
     area_strain,
     dihedral_angles,
+    fold_strength,
     jitter,
     wrinkle_error,
 )
@@ -38,6 +39,15 @@ def test_wrinkles_do_not_care_where_the_cloth_is():
     # Past a half turn the short way counts.
     gap = wrinkle_error(FACES, folded(3.1)[None], folded(-3.1)[None])
     assert gap == pytest.approx(np.degrees(2 * np.pi - 6.2), rel=1e-3)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, -1.5])
+def test_folds_are_as_strong_as_their_angle_wherever_they_are(angle):
+    x = np.stack([folded(angle), folded(angle) + 3.0, folded(-angle)])
+    assert fold_strength(FACES, x) == pytest.approx(np.degrees(abs(angle)), abs=1e-3)
+    assert fold_strength(FACES, np.stack([folded(0.3), folded(0.0)])) == pytest.approx(
+        np.degrees(0.3) / np.sqrt(2.0), rel=1e-4
+    )
 
 
 def test_area_strain_of_a_stretched_sheet():

@@ -17,7 +17,7 @@ from rich.console import Console
 from physxnet_jax.cli import main, parse
 from physxnet_jax.cli._view import view
 from physxnet_jax.errors import FormatError, PhysXNetError
-from physxnet_jax.io import read_obj, split_ways
+from physxnet_jax.io import DEFAULT, MIRROR, RELAX, read_obj, split_ways
 from physxnet_jax.motion import procedural_clip, save_motion
 
 pytest.importorskip("viser")
@@ -182,6 +182,15 @@ def test_live_clothes_are_those_of_the_clip_wherever_it_is_entered(viewer):
     assert 0 < shown.live.milliseconds < np.inf
     # What only the network can answer isn't asked of skinning.
     assert carry_out(dataclasses.replace(SHORT, live=True)).live is None
+
+
+def test_ticks_are_words_behind_the_networks_name(viewer):
+    w = viewer._widgets
+    assert viewer.chosen().weights == SHORT.weights == DEFAULT
+    w[MIRROR].value, w[RELAX].value = True, False
+    assert viewer.chosen().weights == f"{split_ways(DEFAULT)[0]}{MIRROR}"
+    w[MIRROR].value, w[RELAX].value = False, True
+    assert viewer.wait().choice == SHORT
 
 
 def test_live_clothes_are_what_the_page_shows_with_their_time(viewer):
