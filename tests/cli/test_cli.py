@@ -9,11 +9,17 @@ import pytest
 
 from physxnet_jax._environment import check_jaxlib, jaxlib_problem
 from physxnet_jax.cli import main
+from physxnet_jax.cli._commands import Dress, Export, View
 from physxnet_jax.cli._main import _COMMANDS, parse
 from physxnet_jax.dressing import load_ladder
 from physxnet_jax.errors import BrokenInstallError, MotionError, PhysXNetError
 from physxnet_jax.garment import template
-from physxnet_jax.io import load_garment, read_obj, write_obj
+from physxnet_jax.io import DEFAULT, load_garment, read_obj, write_obj
+
+
+@pytest.mark.parametrize("command", [Dress, Export, View])
+def test_commands_take_the_default_network(command):
+    assert command.weights == DEFAULT
 
 
 def test_doctor_and_clips_print_what_there_is(capsys):
