@@ -1,8 +1,10 @@
 """Small files that are right, and a measure of clips, for tests of several rooms."""
 
 import numpy as np
+import pygltflib
 
-from physxnet_jax.motion import LIMBS, clip_transforms
+from physxnet_jax.body import NUM_BODY_VERTICES
+from physxnet_jax.motion import JOINT_MAPS, LIMBS, clip_transforms
 
 BVH = """HIERARCHY
 ROOT Hips
@@ -65,3 +67,68 @@ def limbs_apart(body, rest, a, b):
         cosine = (d * e).sum(1) / np.linalg.norm(d, axis=1) / np.linalg.norm(e, axis=1)
         worst = max(worst, float(np.degrees(np.arccos(np.clip(cosine, -1, 1))).max()))
     return worst
+
+
+def rigged_person(path, body, shape=None, *, unit=0.01, family="vrm"):
+    """The body's own mesh and skin in its bind pose, as a rig of somebody else's names.
+
+    No animation: he stands as he was bound, his joints' axes the world's.
+    """
+    shape = body.default_shape() if shape is None else shape
+    heads = np.asarray(body.joint_positions(body.rest_vertices(shape))[0], np.float64)
+    rest = np.asarray(body.rest_vertices(shape))
+    names = JOINT_MAPS[family]
+    g = pygltflib.GLTF2(scene=0, scenes=[pygltflib.Scene(nodes=[0, 1])])
+    blob = bytearray()
+
+    def put(values, kind, component=5126):
+        raw = np.ascontiguousarray(values).tobytes()
+        g.bufferViews.append(
+            pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=len(raw))
+        )
+        g.accessors.append(
+            pygltflib.Accessor(
+                bufferView=len(g.bufferViews) - 1,
+                componentType=component,
+                count=len(values),
+                type=kind,
+            )
+        )
+        blob.extend(raw)
+        return len(g.accessors) - 1
+
+    g.nodes = [pygltflib.Node(name="Armature", scale=[unit] * 3, children=[2])]
+    g.nodes.append(pygltflib.Node(name="Figure", mesh=0, skin=0))
+    for j, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
+        offset = heads[j] - (heads[parent] if parent >= 0 else 0.0)
+        kids = [k + 2 for k, p in enumerate(body.parents) if p == j]
+        own = names.get(name, f"extra_{name}")
+        g.nodes.append(
+            pygltflib.Node(name=own, children=kids, translation=(offset / unit).tolist())
+        )
+    joints = len(body.parents)
+    binds = np.tile(np.eye(4), (joints, 1, 1))
+    binds[:, :3, :3] /= unit
+    binds[:, :3, 3] = -heads / unit
+    weights = np.asarray(body.weights)[:NUM_BODY_VERTICES]
+    most = np.argsort(-weights, axis=1, kind="stable")[:, :8]
+    share = np.take_along_axis(weights, most, axis=1)
+    sets = {}
+    for k in range(2):
+        part = slice(4 * k, 4 * k + 4)
+        sets[f"JOINTS_{k}"] = put(most[:, part].astype(np.uint8), "VEC4", 5121)
+        sets[f"WEIGHTS_{k}"] = put(share[:, part].astype(np.float32), "VEC4")
+    attributes = pygltflib.Attributes(POSITION=put(rest[:NUM_BODY_VERTICES], "VEC3"), **sets)
+    faces = np.asarray(body.rest_mesh().faces).astype(np.uint32).ravel()
+    primitive = pygltflib.Primitive(attributes=attributes, indices=put(faces, "SCALAR", 5125))
+    g.meshes = [pygltflib.Mesh(primitives=[primitive])]
+    g.skins = [
+        pygltflib.Skin(
+            joints=list(range(2, joints + 2)),
+            inverseBindMatrices=put(binds.transpose(0, 2, 1).astype(np.float32), "MAT4"),
+        )
+    ]
+    g.buffers.append(pygltflib.Buffer(byteLength=len(blob)))
+    g.set_binary_blob(bytes(blob))
+    g.save_binary(str(path))
+    return path

@@ -100,7 +100,8 @@ def test_costs_are_the_measured_ones():
     text = (ROOT / "docs/accuracy-cost.md").read_text()
     own = (ROOT / "docs/own-body.md").read_text()
     assert (ROOT / "experiments/results/own_bodies.md").read_text() in own
-    assert (ROOT / "experiments/results/foreign_character.md").read_text() in own
+    for name in ("foreign_character", "foreign_rig"):
+        assert (ROOT / f"experiments/results/{name}.md").read_text() in own
     for name in (
         "accuracy_cost",
         "frames_seen",

@@ -1,6 +1,8 @@
 """People of one's own, dressed: against the same clothes on the person they were made from."""
 
 import dataclasses
+import pathlib
+import runpy
 
 import fast_simplification
 import jax
@@ -28,6 +30,9 @@ from physxnet_jax.garment import template
 from physxnet_jax.geometry import closest_points, make_mesh, vertex_normals
 from physxnet_jax.io import AnimatedMesh, smooth_normals
 from physxnet_jax.motion import Motion, body_animation, clip_transforms, load_motion
+
+_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
+rigged_person = _SAMPLES["rigged_person"]
 
 FPS = 10.0
 
@@ -248,3 +253,27 @@ def test_the_command_dresses_a_file(man, tmp_path, capsys):
     assert main([*words, "--shape", "gender=1"]) == 2
     assert main(["dress", "walk", "--body-mesh", "me"]) == 2
     assert main(["dress", "walk", "--own-body"]) == 2
+
+
+def test_a_rig_is_dressed_in_somebody_elses_motion(body, tmp_path, capsys):
+    shape = body.shape(gender=1.0, height_up=0.5)
+    path = rigged_person(tmp_path / "me.vrm", body, shape)
+    out = tmp_path / "out.npz"
+    words = ["dress", "punch", "--character", str(path), "--wear", "bottom", "--fps", "10"]
+    assert main([*words, "--frames", "3", "--method", "lbs", "-o", str(out)]) == 0
+    true = dress("punch", ["bottom"], shape=shape, method="lbs", fps=10.0, frames=3)
+    with np.load(out) as data:
+        worn = data["bottom_positions"]
+        # He steps as far as his legs allow, which are longer than the clip's.
+        assert worn.shape == true.garments[0].positions.shape
+        shift = (worn - true.garments[0].positions).mean(axis=(0, 1))
+        assert np.abs(shift).max() < 0.03
+        assert rmse(worn - shift, true.garments[0].positions) < 0.02
+    capsys.readouterr()
+    assert main([*words, "--own-body"]) == 2 and "--own-body" in capsys.readouterr().err
+    assert main(["dress", "walk", "--character-map", "a.toml"]) == 2
+    assert "--character" in capsys.readouterr().err
+    names = tmp_path / "names.toml"
+    names.write_text('Hips = "nowhere"\n')
+    assert main([*words, "--character-map", str(names)]) == 2
+    assert "lacks" in capsys.readouterr().err

@@ -1,6 +1,8 @@
 """People from other programs: every format says the same, in any unit and axes."""
 
 import json
+import pathlib
+import runpy
 import struct
 import tracemalloc
 
@@ -11,6 +13,10 @@ from scipy.spatial.transform import Rotation
 
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.io import AnimatedMesh, read_character, write_clip, write_obj, write_pc2
+from physxnet_jax.motion import body_animation, procedural_clip
+
+_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
+rigged_person = _SAMPLES["rigged_person"]
 
 # A figure of a few triangles, as high as a person.
 POINTS = np.array(
@@ -66,6 +72,26 @@ def test_rate_and_length(clip, tmp_path):
     write_obj(tmp_path / "me.obj", clip[0], FACES)
     slow = read_character(tmp_path / "me.pc2", fps=30.0, source_fps=15.0)[0].positions
     np.testing.assert_allclose(slow[::2], clip, atol=1e-6)
+
+
+def test_a_rig_is_moved_by_somebody_elses_motion(body, rest, tmp_path):
+    """The body's own mesh as a VRM: it goes where the body goes, to a millimetre."""
+    walk = procedural_clip("walk", fps=10.0)
+    path = rigged_person(tmp_path / "me.vrm", body)
+    person, bind, _ = read_character(path, fps=10.0, motion=walk)
+    # Points that coincide are one vertex in a file's mesh: compare triangles.
+    true = np.asarray(body_animation(body, walk))[:, np.asarray(body.rest_mesh().faces)]
+    lowest = true[..., 1].min()
+    np.testing.assert_allclose(
+        person.positions[:, person.faces] + [0.0, lowest, 0.0], true, atol=2e-3
+    )
+    assert bind is not None and person.positions[..., 1].min() == pytest.approx(0.0, abs=1e-5)
+    # The control: without a motion he stands.
+    still = read_character(path, fps=10.0)[0]
+    assert len(still.positions) == 1
+    with pytest.raises(FormatError, match=r"a rig alone.*a \.npz file brings its own"):
+        np.savez(tmp_path / "a.npz", positions=POINTS[None], faces=FACES)
+        read_character(tmp_path / "a.npz", motion=walk)
 
 
 def skinned(

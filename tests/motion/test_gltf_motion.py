@@ -123,6 +123,78 @@ def test_a_walk_through_gltf_is_the_same_walk(body, rest, tmp_path, mode, suffix
     np.testing.assert_allclose(again.root, walk.root, atol=0.01)
 
 
+def as_vrm(path, key, out):
+    """The file with names that say nothing, and VRM's word for which node is which bone."""
+    document = pygltflib.GLTF2().load(str(path))
+    bones = {}
+    known = {"mixamorig:" + JOINT_MAPS["mixamo"][b]: v for b, v in JOINT_MAPS["vrm"].items()}
+    for n, node in enumerate(document.nodes):
+        if node.name in known:
+            bones[known[node.name]] = n
+            node.name = f"bone.{n}"
+    # A name that another node has by right.
+    document.nodes[0].name = "hips"
+    pairs = {b: {"node": n} for b, n in bones.items()}
+    listed = [{"bone": b, "node": n} for b, n in bones.items()]
+    document.extensions = {key: {"humanoid": {"humanBones": listed if key == "VRM" else pairs}}}
+    document.extensionsUsed = [key]
+    if key == "VRMC_vrm_animation":
+        document.skins = []
+    document.save_binary(str(out))
+    return out
+
+
+@pytest.mark.parametrize(
+    "key, name", [("VRM", "a.vrm"), ("VRMC_vrm", "a.vrm"), ("VRMC_vrm_animation", "a.vrma")]
+)
+def test_vrm_says_which_node_is_which_bone(body, rest, tmp_path, key, name):
+    walk = procedural_clip("walk", fps=15.0)
+    plain = write_gltf(tmp_path / "walk.glb", body, rest, walk)
+    path = as_vrm(plain, key, tmp_path / name)
+    again = load_motion(path)
+    assert limbs_apart(body, rest, walk, again) < 0.2
+    np.testing.assert_allclose(again.root, walk.root, atol=0.01)
+    # The control: without its word nobody knows.
+    document = pygltflib.GLTF2().load_binary(str(path))
+    document.extensions = {}
+    document.save_binary(str(path))
+    with pytest.raises(MotionError, match="unknown joints"):
+        load_motion(path)
+
+
+@pytest.mark.parametrize("told", [3, {"hips": 3}, [{"bone": "hips"}], {"hips": {"node": 999}}])
+def test_damaged_words_of_vrm_are_refused(body, rest, tmp_path, told):
+    path = write_gltf(tmp_path / "walk.glb", body, rest, procedural_clip("walk", fps=5.0))
+    document = pygltflib.GLTF2().load(str(path))
+    document.extensions = {"VRM": {"humanoid": {"humanBones": told}}}
+    document.save_binary(str(path))
+    with pytest.raises(MotionError, match=r"walk\.glb.*damaged"):
+        load_motion(path)
+
+
+@pytest.mark.parametrize("packed", ["EXT_meshopt_compression", "KHR_draco_mesh_compression"])
+def test_compressed_files_are_named_and_how_to_unpack_them(body, rest, tmp_path, packed):
+    path = write_gltf(tmp_path / "walk.glb", body, rest, procedural_clip("walk", fps=5.0))
+    document = pygltflib.GLTF2().load(str(path))
+    document.extensionsRequired = [packed]
+    document.save_binary(str(path))
+    with pytest.raises(MotionError, match=rf"{packed}.*gltf-transform"):
+        load_motion(path)
+    # Where the file can be read without it, it is.
+    document.extensionsRequired, document.extensionsUsed = [], [packed]
+    document.save_binary(str(path))
+    assert load_motion(path).num_frames > 2
+
+
+def test_the_joints_of_the_largest_skin_are_the_skeleton(body, rest, tmp_path):
+    walk = procedural_clip("walk", fps=10.0)
+    path = write_gltf(tmp_path / "walk.glb", body, rest, walk)
+    document = pygltflib.GLTF2().load(str(path))
+    document.skins.insert(0, pygltflib.Skin(joints=[3, 4]))
+    document.save_binary(str(path))
+    assert limbs_apart(body, rest, walk, load_motion(path)) < 0.2
+
+
 def test_a_trunk_without_a_direction_is_refused(tmp_path):
     """Found by a fuzzer: a figure that lies, one hip above the other,
     in line with the shoulders."""

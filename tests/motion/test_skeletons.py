@@ -106,14 +106,20 @@ def degrees(body, rest, a, b):
     return limbs_apart(body, rest, a, b), float(turns.max())
 
 
-@pytest.mark.parametrize("family", ["mixamo", "rokoko", "lafan", "smpl", "cmu-motionbuilder"])
+# What programs put before names, and a name that separates its parts in another way.
+PREFIXES = {"mixamo": "mixamorig:", "biped": "Bip001_", "rigify": "DEF-", "vroid": "J_Bip_"}
+PREFIXES |= {"character-creator": "CC_Base_", "vrm": "Avatar.", "unreal-4": "ue4_"}
+
+
+@pytest.mark.parametrize("family", sorted(JOINT_MAPS.keys() - {"cmu-asf", "cmu-daz"}))
 def test_a_walk_in_the_names_of_others_is_the_same_walk(body, rest, tmp_path, family):
     walk = procedural_clip("walk", fps=15.0)
     odd = along_bones(body, rest) if family == X_ALONG_BONE else None
     path = tmp_path / "a.bvh"
-    prefix = "mixamorig:" if family == "mixamo" else ""
-    path.write_text(bvh(body, rest, walk, JOINT_MAPS[family], odd, prefix=prefix))
-    assert find_joint_map(read_bvh(path))[0] == family
+    names = {b: s.replace(" ", "_") for b, s in JOINT_MAPS[family].items()}
+    path.write_text(bvh(body, rest, walk, names, odd, prefix=PREFIXES.get(family, "")))
+    found, joints = find_joint_map(read_bvh(path))
+    assert found == family and joints.keys() == names.keys()
     again = load_motion(path)
     assert again.num_frames == walk.num_frames
     limbs, turns = degrees(body, rest, walk, again)

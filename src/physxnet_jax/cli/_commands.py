@@ -17,18 +17,23 @@ class Dress:
       physxnet dress dance.bvh --wear my_shirt.obj bottom --method simulate -o out.pc2
       physxnet dress walk --wear dress --budget-ms 5 -o walk.usdc
       physxnet dress my_dancer.glb --own-body --wear top bottom -o dancer.usdc
+      physxnet dress dance.bvh --character my_avatar.vrm --wear dress -o avatar.glb
     """
 
     motion: tyro.conf.Positional[str]
-    """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
+    """A .bvh, .amc, .glb, .gltf, .vrma or .npz file, or a built-in clip (see `physxnet clips`)."""
     wear: tuple[str, ...] = ("top", "bottom")
     """Templates (top, bottom, dress) and files (.obj, .glb, .gltf, .usd*, .ply, .stl; coat.obj=top
     says what one is dressed as): tops over dresses over trousers, of two of one kind the second
     over the first."""
     own_body: bool = False
     """The file is a person of your own to be dressed: .glb, .usd, .pc2, .mdd (with OBJ), .npz."""
+    character: pathlib.Path | None = None
+    """A rigged person of your own (.glb, .gltf, .vrm), whom the motion moves."""
+    character_map: pathlib.Path | None = None
+    """Joint names of --character, for unknown ones: TOML lines like Hips = "pelvis"."""
     body_mesh: str | None = None
-    """Of --own-body: name of the body's mesh, in a file of several."""
+    """Of --own-body and --character: name of the body's mesh, in a file of several."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Result: .usdc, .usd, .usda, .pc2, .mdd (with OBJ), .glb, .html, .obj (one a frame), .npz."""
     preview: pathlib.Path | None = None

@@ -208,7 +208,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     from ..body import load_body
     from ..dressing import dress, load_character
     from ..io import check_output, write_clip
-    from ..motion import load_motion
+    from ..motion import Motion, load_motion
     from ..viewer import check_preview, render_preview
     from ._calibrate import choose
     from ._table import closing_table, report
@@ -224,22 +224,20 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
             "--own-body brings its shape along and needs no joints: leave out --shape,"
             " --joint-map and --skeleton."
         )
-    if command.body_mesh is not None and not command.own_body:
-        raise PhysXNetError("--body-mesh chooses a mesh for --own-body: add that.")
+    if command.character is not None and (command.shape or command.own_body):
+        raise PhysXNetError(
+            "--character is a person of your own shape, moved by the file before it: leave out"
+            " --shape and --own-body."
+        )
+    if command.body_mesh is not None and not (command.own_body or command.character):
+        raise PhysXNetError("--body-mesh chooses a mesh for --own-body or --character: add one.")
+    if command.character_map is not None and command.character is None:
+        raise PhysXNetError("--character-map names joints of --character: add that.")
     if command.quiet or command.json:
         console = Console(quiet=True)
     with progress_bars(console) as progress:
-        if command.own_body:
-            motion = load_character(
-                command.motion,
-                fps=command.fps,
-                source_fps=command.source_fps,
-                mesh=command.body_mesh,
-                frames=command.frames,
-                progress=progress,
-            )
-            frames = motion.motion.num_frames
-        else:
+        motion = None
+        if not command.own_body:
             motion = load_motion(
                 command.motion,
                 fps=command.fps,
@@ -248,7 +246,20 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
                 joint_map=command.joint_map,
                 shape=shape,
             )
-            frames = motion.num_frames
+        person = command.motion if command.own_body else command.character
+        if person is not None:
+            motion = load_character(
+                person,
+                fps=command.fps,
+                source_fps=command.source_fps,
+                mesh=command.body_mesh,
+                frames=command.frames,
+                motion=motion,
+                joint_map=command.character_map,
+                progress=progress,
+            )
+        assert motion is not None
+        frames = (motion if isinstance(motion, Motion) else motion.motion).num_frames
         if command.out is not None:
             check_output(command.out, min(frames, command.frames or frames))
         ways = {

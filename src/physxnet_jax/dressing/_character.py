@@ -2,7 +2,7 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,16 @@ from ..garment import Garment
 from ..geometry import each_frame
 from ..io import AnimatedMesh, read_character, smooth_normals
 from ..models import Wearable, skin_points
-from ..motion import BLOCK, Motion, body_animation, follow_surface, padded_block
+from ..motion import (
+    BLOCK,
+    Motion,
+    body_animation,
+    follow_surface,
+    load_motion,
+    padded_block,
+    read_joint_map,
+    resample,
+)
 from ._push_out import SkinPatch, push_out_of
 
 # Skin whose leftover movement a garment vertex takes over: so many vertices, over so far [m].
@@ -72,6 +81,8 @@ def load_character(
     source_fps: float | int | None = None,
     mesh: str | None = None,
     frames: int | None = None,
+    motion: Motion | str | pathlib.Path | None = None,
+    joint_map: Mapping[str, str] | str | pathlib.Path | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Character:
     """A person of one's own from a file, to be handed to `dress`.
@@ -83,6 +94,10 @@ def load_character(
         source_fps: True rate of a file that doesn't say it.
         mesh: Name of the body's mesh in the file.
         frames: Keep only this many frames.
+        motion: What moves the person's skin instead of the file's own animation: a clip,
+            or what `load_motion` takes. Of a rigged glTF or VRM, whose bones are known by
+            their names, by VRM or by `joint_map`.
+        joint_map: Body joint to the person's joint, or a file of them (`read_joint_map`).
         progress: Called with a stage, steps done and steps in all.
 
     Returns:
@@ -91,8 +106,21 @@ def load_character(
     Raises:
         PhysXNetError: What can't be read, or no person whom the body fits.
     """
+    if isinstance(motion, str | pathlib.Path):
+        motion = load_motion(motion, fps=fps)
+    if motion is not None:
+        motion = motion if motion.fps == fps else resample(motion, fps)
+        motion = Motion(motion.rotations[:frames], motion.root[:frames], motion.fps, motion.name)
+    if isinstance(joint_map, str | pathlib.Path):
+        joint_map = read_joint_map(joint_map)
     person, bind, notes = read_character(
-        path, fps=fps, source_fps=source_fps, mesh=mesh, frames=frames
+        path,
+        fps=fps,
+        source_fps=source_fps,
+        mesh=mesh,
+        frames=frames,
+        motion=motion,
+        joint_map=joint_map,
     )
     character = make_character(person, float(fps), bind=bind, progress=progress)
     return dataclasses.replace(character, notes=(*notes, *character.notes))

@@ -1,21 +1,23 @@
 """Animated persons of other programs: point caches, USD, npz, glTF."""
 
 import dataclasses
+import functools
 import pathlib
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import FormatError
 from ..files import read_arrays
-from ..motion import nominal_rate
+from ..motion import GLTF_FORMATS, Motion, nominal_rate
 from ._clip import AnimatedMesh
 from ._mdd import read_mdd
 from ._moving import Moving, joined, named
 from ._obj import read_obj
 from ._pc2 import read_pc2
 
-CHARACTER_FORMATS = (".glb", ".gltf", ".usdc", ".usd", ".usda", ".pc2", ".mdd", ".npz")
+CHARACTER_FORMATS = (".glb", ".gltf", ".vrm", ".usdc", ".usd", ".usda", ".pc2", ".mdd", ".npz")
 """Endings that `read_character` knows."""
 
 # Coordinates of a clip that are read at most.
@@ -33,6 +35,8 @@ def read_character(
     source_fps: float | int | None = None,
     mesh: str | None = None,
     frames: int | None = None,
+    motion: Motion | None = None,
+    joint_map: Mapping[str, str] | None = None,
 ) -> tuple[AnimatedMesh, Float[np.ndarray, "vertices 3"] | None, tuple[str, ...]]:
     """A person of one's own, animated elsewhere.
 
@@ -48,6 +52,9 @@ def read_character(
         source_fps: True rate of a file that doesn't say it; else 30.
         mesh: Name of the mesh to take.
         frames: Keep only this many frames.
+        motion: What moves a rigged person (glTF, VRM) instead of the file's animation; at
+            its own rate.
+        joint_map: Body joint to the file's joint, for `motion` and unknown names.
 
     Returns:
         The person [m], Y up; the bind pose of a skin, else None; what was found out
@@ -68,8 +75,16 @@ def read_character(
         )
     if not path.is_file():
         raise FormatError(f"{path}: no such file. Check the path.")
-    if suffix in (".glb", ".gltf"):
-        from ._gltf_character import read_gltf_meshes as read
+    if motion is not None and suffix not in GLTF_FORMATS:
+        raise FormatError(
+            f"{path}: another motion can move a rig alone, from {', '.join(GLTF_FORMATS[:3])};"
+            f" a {suffix} file brings its own."
+        )
+    if suffix in GLTF_FORMATS:
+        from ._gltf_character import read_gltf_meshes
+
+        read = functools.partial(read_gltf_meshes, motion=motion, joint_map=joint_map)
+        fps = fps if motion is None else motion.fps
     elif suffix.startswith(".usd"):
         from ._usd_character import read_usd_meshes as read
     elif suffix == ".npz":

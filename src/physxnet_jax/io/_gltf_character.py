@@ -1,14 +1,15 @@
 """Meshes of a glTF as its animation moves them: skins and morph targets."""
 
 import contextlib
+import dataclasses
 import pathlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import FormatError, PhysXNetError
-from ..motion import GltfFile
+from ..motion import GltfFile, Motion, drive
 from ._moving import Moving, welded
 
 _TRIANGLES = 4
@@ -19,13 +20,19 @@ _MOST_NODES = 6e6
 
 
 def read_gltf_meshes(
-    path: pathlib.Path, fps: float
+    path: pathlib.Path,
+    fps: float,
+    motion: Motion | None = None,
+    joint_map: Mapping[str, str] | None = None,
 ) -> tuple[list[Moving], float | None, str | None]:
     """Every mesh that a skin or morph targets move; all that stand still if none does.
 
     Args:
         path: The file.
         fps: Frames a second at which the animation is read.
+        motion: What moves the skin instead of the file's own animation, `fps` frames a
+            second; the lowest point of the clip is on the floor.
+        joint_map: Body joint to the file's joint, for `motion`.
 
     Returns:
         The meshes, their rate, and the axis that is up.
@@ -39,7 +46,17 @@ def read_gltf_meshes(
     """
     with _damage_told(path):
         file = GltfFile(path)
-        parts = _read(file, file.frame_times(rate=fps)[0])
+        if motion is not None:
+            parts = _read(
+                file, None, motion.num_frames, lambda: drive(file, motion, joint_map=joint_map)
+            )
+            parts = [p for p in parts if p.bind is not None]
+            low = min((float(p.positions[..., 1].min()) for p in parts), default=0.0)
+            shift = np.array([0.0, low, 0.0], np.float32)
+            parts = [dataclasses.replace(p, positions=p.positions - shift) for p in parts]
+        else:
+            times = file.frame_times(rate=fps)[0]
+            parts = _read(file, times, len(times), lambda: file.world(times))
         moving = [p for p in parts if p.bind is not None] or parts
         return [welded(p) for p in moving], float(fps), "Y"
 
@@ -52,7 +69,8 @@ def read_gltf_still(path: pathlib.Path) -> list[Moving]:
         MotionError: A damaged file.
     """
     with _damage_told(path):
-        return _read(GltfFile(path), None)
+        file = GltfFile(path)
+        return _read(file, None, 1, file.world)
 
 
 @contextlib.contextmanager
@@ -67,16 +85,19 @@ def _damage_told(path: pathlib.Path) -> Iterator[None]:
         ) from error
 
 
-def _read(file: GltfFile, times: Float[np.ndarray, " frames"] | None) -> list[Moving]:
-    """Meshes at these times; as the file stands without any."""
-    count = 1 if times is None else len(times)
+def _read(
+    file: GltfFile,
+    times: Float[np.ndarray, " frames"] | None,
+    count: int,
+    place: Callable[[], Float[np.ndarray, "frames nodes 4 4"]],
+) -> list[Moving]:
+    """Meshes over `count` frames where `place` puts the nodes; morph targets at `times`."""
     if count * len(file.document.nodes) > _MOST_NODES:
         raise FormatError(
             f"{file.path}: {count:,} frames of {len(file.document.nodes)} nodes are more than are"
             " read. Export a part of the clip, or the person alone."
         )
-    still = file.world()[0]
-    world = still[None] if times is None else file.world(times)
+    still, world = file.world()[0], place()
     parts: list[Moving] = []
     points = 0
     for n, node in enumerate(file.document.nodes):

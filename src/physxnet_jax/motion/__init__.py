@@ -3,9 +3,10 @@
 from ._amass import amass_clip as amass_clip
 from ._asf_amc import read_amc as read_amc
 from ._bvh import read_bvh as read_bvh
+from ._drive import drive as drive
 from ._follow import follow_surface as follow_surface
 from ._gltf import read_gltf as read_gltf
-from ._gltf_file import GltfFile as GltfFile
+from ._gltf_file import GLTF_FORMATS as GLTF_FORMATS, GltfFile as GltfFile
 from ._load import load_motion as load_motion, save_motion as save_motion
 from ._motion import (
     Motion as Motion,

@@ -1,4 +1,4 @@
-"""Reader of glTF animations: the skeleton of a skin, or of all that turns."""
+"""Reader of glTF skeletons and animations: the joints of a skin, or all that turns."""
 
 import pathlib
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import MotionError, PhysXNetError
-from ._gltf_file import GltfFile
+from ._gltf_file import GltfFile, nearest_turns
 from ._source import SourceClip
 
 
@@ -17,9 +17,9 @@ def read_gltf(path: str | pathlib.Path) -> SourceClip:
         path: The file.
 
     Returns:
-        World rotations and positions of the first skin's joints, or of every node that
-        is animated if there is no skin. The nodes as they stand in the file are the rest
-        pose.
+        World rotations and positions of the joints of the largest skin, or of every node
+        that is animated if there is no skin. The nodes as they stand in the file are the
+        rest pose. What VRM calls a bone of the body has that name.
 
     Raises:
         MotionError: Damaged files, files without an animation, a skeleton scaled to
@@ -47,11 +47,32 @@ def _read(path: pathlib.Path) -> SourceClip:
     file = GltfFile(path)
     times, fps = file.frame_times()
     nodes = skeleton_nodes(file)
-    names = [str(file.document.nodes[n].name or f"node{n}").split(":")[-1] for n in nodes]
+    return _clip(file, nodes, file.world(times)[:, nodes], fps)
+
+
+def read_rig(file: GltfFile) -> tuple[SourceClip, list[int]]:
+    """The skeleton of a file as it stands, as a clip of one frame, and its joints' nodes.
+
+    Raises:
+        MotionError: No skeleton, or one scaled to nothing.
+    """
+    nodes = skeleton_nodes(file)
+    return _clip(file, nodes, file.world()[:, nodes], 30.0), nodes
+
+
+def _clip(
+    file: GltfFile, nodes: list[int], moving: Float[np.ndarray, "frames joints 4 4"], fps: float
+) -> SourceClip:
+    bones = file.bones()
+    taken = set(bones.values())
+    names = []
+    for n in nodes:
+        own = str(file.document.nodes[n].name or f"node{n}").split(":")[-1]
+        names.append(bones.get(n, f"{own} (node {n})" if own in taken else own))
     if len(set(names)) < len(names):
-        raise MotionError.at(path, None, "two joints of one name", "Rename one")
+        raise MotionError.at(file.path, None, "two joints of one name", "Rename one")
     parents = skeleton_parents(file, nodes)
-    moving, still = file.world(times)[:, nodes], file.world()[:, nodes]
+    still = file.world()[:, nodes]
     rotations, rest = _turns(file, moving), _turns(file, still)[0]
     return SourceClip(
         tuple(names),
@@ -60,22 +81,24 @@ def _read(path: pathlib.Path) -> SourceClip:
         rotations,
         moving[:, 0, :3, 3],
         fps,
-        path.stem,
-        str(path),
+        file.path.stem,
+        str(file.path),
         rest,
         _in_parents(rotations, moving[:, :, :3, 3], parents),
     )
 
 
 def skeleton_nodes(file: GltfFile) -> list[int]:
-    """Nodes of the first skin's joints, or all that turn; parents first."""
+    """Nodes of the largest skin's joints and of VRM's bones, or all that turn; parents first."""
     document = file.document
     if document.skins:
-        wanted = {file.index(j, document.nodes, "joint") for j in document.skins[0].joints}
+        most = max(document.skins, key=lambda skin: len(skin.joints))
+        wanted = {file.index(j, document.nodes, "joint") for j in most.joints} | set(file.bones())
     else:
+        animation = document.animations[0] if document.animations else None
         wanted = {
             file.index(c.target.node, document.nodes, "node")
-            for c in document.animations[0].channels
+            for c in (animation.channels if animation else ())
             if c.target.path == "rotation" and c.target.node is not None
         }
     nodes = [n for n in file.order if n in wanted]
@@ -100,13 +123,10 @@ def _turns(
     file: GltfFile, matrices: Float[np.ndarray, "frames joints 4 4"]
 ) -> Float[np.ndarray, "frames joints 3 3"]:
     """Rotations nearest to the matrices, which may scale."""
-    u, scales, v = np.linalg.svd(matrices[:, :, :3, :3])
-    if (scales[..., 2] < 1e-9).any():
-        raise file.broken("a joint is scaled to nothing")
-    turn = u @ v
-    flip = np.linalg.det(turn) < 0
-    u[..., 2] = np.where(flip[..., None], -u[..., 2], u[..., 2])
-    return u @ v
+    try:
+        return nearest_turns(matrices[:, :, :3, :3])
+    except ValueError as error:
+        raise file.broken(str(error)) from None
 
 
 def _in_parents(

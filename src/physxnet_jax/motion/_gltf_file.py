@@ -4,6 +4,7 @@ import base64
 import binascii
 import pathlib
 import urllib.parse
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,16 @@ _MOST_KEYS = 100_000_000
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _LENGTHS = {"translation": 3, "rotation": 4, "scale": 3}
+# Extensions that hide numbers, and what undoes them.
+_PACKED = {
+    "EXT_meshopt_compression": "npx @gltf-transform/cli copy IN OUT",
+    "KHR_draco_mesh_compression": "npx @gltf-transform/cli copy IN OUT",
+}
+# Where VRM says which node is which bone: of a person, of a clip, and its version 0.
+_HUMANOID = ("VRMC_vrm", "VRMC_vrm_animation", "VRM")
+
+GLTF_FORMATS = (".glb", ".gltf", ".vrm", ".vrma")
+"""Endings of glTF files; VRM's persons and clips are such."""
 
 
 class GltfFile:
@@ -38,13 +49,20 @@ class GltfFile:
 
     References:
         Khronos, glTF 2.0, sections 3.5 (nodes), 3.6 (buffers and accessors) and
-        3.11 (animations).
+        3.11 (animations); VRM Consortium, VRMC_vrm-1.0, humanoid.
     """
 
     def __init__(self, path: str | pathlib.Path) -> None:
         self.path = pathlib.Path(path)
         self._buffers: dict[int, bytes] = {}
         self.document = _parsed(self.path)
+        for packed in _PACKED.keys() & set(self.document.extensionsRequired or ()):
+            raise MotionError.at(
+                self.path,
+                None,
+                f"its numbers are compressed ({packed}), which isn't read",
+                f"Unpack it: {_PACKED[packed]}",
+            )
         nodes = self.document.nodes
         if not nodes or len(nodes) > _MAX_NODES:
             raise self.broken(f"{len(nodes)} nodes")
@@ -66,6 +84,21 @@ class GltfFile:
         if type(value) is not int or not 0 <= value < len(of or ()):
             raise self.broken(f"{what} {value} doesn't exist")
         return value
+
+    def bones(self) -> dict[int, str]:
+        """Nodes that VRM's extensions call a bone of the body: node to bone."""
+        told = self.document.extensions or {}
+        for key in _HUMANOID:
+            humanoid = told.get(key, {}).get("humanoid", {}).get("humanBones")
+            if not humanoid:
+                continue
+            pairs = (
+                [(name, bone["node"]) for name, bone in humanoid.items()]
+                if isinstance(humanoid, dict)
+                else [(bone["bone"], bone["node"]) for bone in humanoid]
+            )
+            return {self.index(n, self.document.nodes, "node"): str(b) for b, n in pairs}
+        return {}
 
     def accessor(self, which: object) -> np.ndarray:
         """Values of an accessor, shape [count] or [count, width].
@@ -139,14 +172,41 @@ class GltfFile:
             for kind in place.keys() & {k for m, k in tracks if m == n}:
                 keys, values, mode = tracks[n, kind]
                 place[kind] = _at(keys, values, mode, at, kind)
-            m = np.zeros((len(at), 4, 4))
-            turn = Rotation.from_quat(place["rotation"]).as_matrix()
-            m[:, :3, :3] = turn * place["scale"][:, None]
-            m[:, :3, 3] = place["translation"]
-            m[:, 3, 3] = 1.0
-            parent = self.parents[n]
-            out[:, n] = m if parent < 0 else out[:, parent] @ m
+            self._put(out, n, Rotation.from_quat(place["rotation"]).as_matrix(), place)
         return out
+
+    def posed(
+        self, turns: Mapping[int, Float[np.ndarray, "frames 3 3"]]
+    ) -> Float[np.ndarray, "frames nodes 4 4"]:
+        """World matrices of all nodes where some are turned as told, the others as they stand.
+
+        Args:
+            turns: World rotations by node, scaling apart.
+        """
+        frames = len(next(iter(turns.values())))
+        out = np.zeros((frames, len(self.parents), 4, 4))
+        for n in self.order:
+            place = self.local(n)
+            turn = Rotation.from_quat(place["rotation"]).as_matrix()[None]
+            if n in turns:
+                above = out[:, self.parents[n], :3, :3] if self.parents[n] >= 0 else np.eye(3)[None]
+                turn = np.swapaxes(nearest_turns(above), 1, 2) @ turns[n]
+            self._put(out, n, turn, {k: v[None] for k, v in place.items()})
+        return out
+
+    def _put(
+        self,
+        out: Float[np.ndarray, "frames nodes 4 4"],
+        n: int,
+        turn: Float[np.ndarray, "_ 3 3"],
+        place: dict[str, Float[np.ndarray, "_ n"]],
+    ) -> None:
+        m = np.zeros((len(out), 4, 4))
+        m[:, :3, :3] = turn * place["scale"][:, None]
+        m[:, :3, 3] = place["translation"]
+        m[:, 3, 3] = 1.0
+        parent = self.parents[n]
+        out[:, n] = m if parent < 0 else out[:, parent] @ m
 
     def frame_times(
         self, animation: int = 0, *, rate: float | None = None
@@ -282,6 +342,22 @@ class GltfFile:
             for k, m in enumerate(reversed(chain)):
                 depth[m] = base + 1 + k
         return np.argsort(depth, kind="stable").tolist()
+
+
+def nearest_turns(
+    matrices: Float[np.ndarray, "*rows 3 3"],
+) -> Float[np.ndarray, "*rows 3 3"]:
+    """The rotations nearest to matrices that may scale.
+
+    Raises:
+        ValueError: A matrix that scales to nothing.
+    """
+    u, scales, v = np.linalg.svd(matrices)
+    if (scales[..., 2] < 1e-9).any():
+        raise ValueError("a joint is scaled to nothing")
+    flip = np.linalg.det(u @ v) < 0
+    u[..., 2] = np.where(flip[..., None], -u[..., 2], u[..., 2])
+    return u @ v
 
 
 def _parsed(path: pathlib.Path) -> Any:

@@ -14,6 +14,7 @@ from ._amass import AMASS_ARRAYS, amass_clip
 from ._asf_amc import read_amc
 from ._bvh import read_bvh
 from ._gltf import read_gltf
+from ._gltf_file import GLTF_FORMATS
 from ._motion import Motion, make_motion, resample
 from ._procedural import CLIPS, procedural_clip
 from ._retarget import retarget
@@ -35,7 +36,7 @@ def load_motion(
 
     Args:
         motion: A file or the name of a built-in clip. Files are `.bvh`, `.amc` (with its
-            ASF), `.glb` or `.gltf` with a skin and an animation, and `.npz`: one that
+            ASF), `.glb`, `.gltf` or `.vrma` with an animation, and `.npz`: one that
             `save_motion` wrote, or one of AMASS (SMPL, SMPL+H or SMPL-X poses).
         fps: Resample to this rate [1/s].
         source_fps: True rate of the file, where its header is wrong or silent (CMU
@@ -67,7 +68,7 @@ def load_motion(
         source = read_bvh(path)
     elif suffix == ".amc":
         source = read_amc(path, skeleton)
-    elif suffix in (".glb", ".gltf"):
+    elif suffix in GLTF_FORMATS:
         source = read_gltf(path)
     elif suffix == ".npz":
         read = _read_npz(path)
@@ -78,7 +79,7 @@ def load_motion(
         raise MotionError.at(path, None, "FBX isn't read", "Export BVH or glTF, from Blender say")
     else:
         raise MotionError(
-            f"{motion}: neither a .bvh, .amc, .glb, .gltf or .npz file nor a built-in clip"
+            f"{motion}: neither a .bvh, .amc, .glb, .gltf, .vrma or .npz file nor a built-in clip"
             f" ({', '.join(CLIPS)})."
         )
     if source is not None:

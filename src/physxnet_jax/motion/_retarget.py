@@ -1,6 +1,6 @@
 """From any humanoid skeleton to the body's own."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax.numpy as jnp
 import numpy as np
@@ -45,6 +45,47 @@ def retarget(
         MotionError: Unknown joints, a map without the limbs, a limb of length zero.
     """
     body = load_body() if body is None else body
+    index = joint_index(source, body, joint_map)
+    may_have_t_pose = source.rest is None
+    source = upright(source, index)
+    reference, start, stance = reference_pose(source, index, may_have_t_pose)
+    if start >= len(source.root):
+        raise MotionError.at(
+            source.path, None, "only a T-pose frame, no motion", "Export more frames"
+        )
+    directions = limb_directions(source, index, reference)
+    aligned = align_global(body, {k: stance.T @ d for k, d in directions.items()}, shape)
+    aligned = [Rotation.from_matrix(stance) * a for a in aligned]
+    world = _world_rotations(body, source, index, reference, aligned, start)
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    heads = np.asarray(body.joint_positions(rest)[0], dtype=np.float64)
+    at = body.joint_names.index
+    positions = source.positions()[start:]
+    scale = leg_length(heads, at) / leg_length(positions[0], index.__getitem__)
+    hips = [index["LeftUpLeg"], index["RightUpLeg"]]
+    middle = 0.5 * (heads[at("LeftUpLeg")] + heads[at("RightUpLeg")]) - heads[0]
+    root = scale * positions[:, hips].mean(axis=1) - world[:, 0] @ middle
+    local = world.copy()
+    for j, parent in enumerate(body.parents):
+        if parent >= 0:
+            local[:, j] = np.swapaxes(world[:, parent], 1, 2) @ world[:, j]
+    quaternions = continuous(
+        Rotation.from_matrix(local.reshape(-1, 3, 3))
+        .as_quat(scalar_first=True)
+        .reshape(len(root), -1, 4)
+    )
+    motion = make_motion(quaternions, root, source.fps, name=source.name)
+    return stand_on_floor(body, motion, rest)
+
+
+def joint_index(
+    source: SourceClip, body: Body, joint_map: Mapping[str, str] | None = None
+) -> dict[str, int]:
+    """Joints of the body to places of theirs in a skeleton, by a map or by the names.
+
+    Raises:
+        MotionError: Unknown joints, a map without the limbs.
+    """
     joints = dict(joint_map) if joint_map is not None else find_joint_map(source)[1]
     if NEEDED - joints.keys() or joints.keys() - set(body.joint_names):
         raise MotionError.at(
@@ -64,46 +105,17 @@ def retarget(
                 f"It has: {', '.join(source.names[:40])}",
             )
         index[b] = source.names.index(s)
-    may_have_t_pose = source.rest is None
-    source = upright(source, index)
-    reference, start, stance = reference_pose(source, index, may_have_t_pose)
-    if start >= len(source.root):
-        raise MotionError.at(
-            source.path, None, "only a T-pose frame, no motion", "Export more frames"
-        )
-    directions = limb_directions(source, index, reference)
-    aligned = align_global(body, {k: stance.T @ d for k, d in directions.items()}, shape)
-    aligned = [Rotation.from_matrix(stance) * a for a in aligned]
-    world = _world_rotations(body, source, index, reference, aligned, start)
-    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
-    heads = np.asarray(body.joint_positions(rest)[0], dtype=np.float64)
-    at = body.joint_names.index
-    legs = [
-        np.linalg.norm(heads[at(f"{s}Leg")] - heads[at(f"{s}UpLeg")])
-        + np.linalg.norm(heads[at(f"{s}Foot")] - heads[at(f"{s}Leg")])
-        for s in ("Left", "Right")
+    return index
+
+
+def leg_length(positions: Float[np.ndarray, "joints 3"], place: Callable[[str], int]) -> float:
+    """Length of both legs from hip to ankle, joints where `place` says."""
+    ways = [
+        positions[place(f"{side}{low}")] - positions[place(f"{side}{high}")]
+        for side in ("Left", "Right")
+        for high, low in (("UpLeg", "Leg"), ("Leg", "Foot"))
     ]
-    positions = source.positions()[start:]
-    source_legs = [
-        np.linalg.norm(positions[0, index[f"{s}Leg"]] - positions[0, index[f"{s}UpLeg"]])
-        + np.linalg.norm(positions[0, index[f"{s}Foot"]] - positions[0, index[f"{s}Leg"]])
-        for s in ("Left", "Right")
-    ]
-    scale = sum(legs) / sum(source_legs)
-    hips = [index["LeftUpLeg"], index["RightUpLeg"]]
-    middle = 0.5 * (heads[at("LeftUpLeg")] + heads[at("RightUpLeg")]) - heads[0]
-    root = scale * positions[:, hips].mean(axis=1) - world[:, 0] @ middle
-    local = world.copy()
-    for j, parent in enumerate(body.parents):
-        if parent >= 0:
-            local[:, j] = np.swapaxes(world[:, parent], 1, 2) @ world[:, j]
-    quaternions = continuous(
-        Rotation.from_matrix(local.reshape(-1, 3, 3))
-        .as_quat(scalar_first=True)
-        .reshape(len(root), -1, 4)
-    )
-    motion = make_motion(quaternions, root, source.fps, name=source.name)
-    return stand_on_floor(body, motion, rest)
+    return float(np.linalg.norm(ways, axis=1).sum())
 
 
 def stand_on_floor(body: Body, motion: Motion, rest: Float[Array, "all 3"]) -> Motion:

@@ -11,18 +11,19 @@ _SIDES = (("Left", "l", "L"), ("Right", "r", "R"))
 _TRUNK = ("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head")
 _ARM = ("Shoulder", "Arm", "ForeArm", "Hand")
 _LEG = ("UpLeg", "Leg", "Foot", "ToeBase")
+_MARKS = str.maketrans("", "", " _.-")
 
 
 def _family(
     trunk: tuple[str | None, ...], arm: tuple[str, ...], leg: tuple[str | None, ...]
 ) -> dict[str, str]:
-    """Body joint to source joint; '{S}' is Left or Right, '{l}' left, '{s}' l."""
+    """Body joint to source joint; '{S}' is Left or Right, '{l}' left, '{s}' l, '{B}' L."""
     out = {b: s for b, s in zip(_TRUNK, trunk, strict=True) if s}
-    for side, small, _ in _SIDES:
+    for side, small, big in _SIDES:
         for names, sources in ((_ARM, arm), (_LEG, leg)):
             for b, s in zip(names, sources, strict=True):
                 if s:
-                    out[side + b] = s.format(S=side, s=small, l=side.lower())
+                    out[side + b] = s.format(S=side, s=small, l=side.lower(), B=big)
     return out
 
 
@@ -67,6 +68,69 @@ JOINT_MAPS: dict[str, dict[str, str]] = {
         ("{l}_collar", "{l}_shoulder", "{l}_elbow", "{l}_wrist"),
         ("{l}_hip", "{l}_knee", "{l}_ankle", "{l}_foot"),
     ),
+    # VRM's humanoid, which is Unity's.
+    "vrm": _family(
+        ("hips", "spine", "chest", "upperChest", "neck", None, "head"),
+        ("{l}Shoulder", "{l}UpperArm", "{l}LowerArm", "{l}Hand"),
+        ("{l}UpperLeg", "{l}LowerLeg", "{l}Foot", "{l}Toes"),
+    ),
+    "vroid": _family(
+        ("C_Hips", "C_Spine", "C_Chest", "C_UpperChest", "C_Neck", None, "C_Head"),
+        ("{B}_Shoulder", "{B}_UpperArm", "{B}_LowerArm", "{B}_Hand"),
+        ("{B}_UpperLeg", "{B}_LowerLeg", "{B}_Foot", "{B}_ToeBase"),
+    ),
+    "unreal-5": _family(
+        ("pelvis", "spine_01", "spine_03", "spine_05", "neck_01", "neck_02", "head"),
+        ("clavicle_{s}", "upperarm_{s}", "lowerarm_{s}", "hand_{s}"),
+        ("thigh_{s}", "calf_{s}", "foot_{s}", "ball_{s}"),
+    ),
+    "unreal-4": _family(
+        ("pelvis", "spine_01", "spine_02", "spine_03", "neck_01", None, "head"),
+        ("clavicle_{s}", "upperarm_{s}", "lowerarm_{s}", "hand_{s}"),
+        ("thigh_{s}", "calf_{s}", "foot_{s}", "ball_{s}"),
+    ),
+    # Blender's, its bones of deformation too (DEF-).
+    "rigify": _family(
+        ("spine", *(f"spine.00{n}" for n in range(1, 7))),
+        ("shoulder.{B}", "upper_arm.{B}", "forearm.{B}", "hand.{B}"),
+        ("thigh.{B}", "shin.{B}", "foot.{B}", "toe.{B}"),
+    ),
+    "makehuman": _family(
+        ("root", "spine05", "spine03", "spine01", "neck01", "neck03", "head"),
+        ("clavicle.{B}", "upperarm01.{B}", "lowerarm01.{B}", "wrist.{B}"),
+        ("upperleg01.{B}", "lowerleg01.{B}", "foot.{B}", None),
+    ),
+    # 3ds Max's character studio: Bip01 or Bip001 stands before every name.
+    "biped": _family(
+        ("Pelvis", "Spine", "Spine1", "Spine2", "Neck", None, "Head"),
+        ("{B} Clavicle", "{B} UpperArm", "{B} Forearm", "{B} Hand"),
+        ("{B} Thigh", "{B} Calf", "{B} Foot", "{B} Toe0"),
+    ),
+    "daz-genesis": _family(
+        ("hip", "abdomenLower", "abdomenUpper", "chestUpper", "neckLower", "neckUpper", "head"),
+        ("{s}Collar", "{s}ShldrBend", "{s}ForearmBend", "{s}Hand"),
+        ("{s}ThighBend", "{s}Shin", "{s}Foot", "{s}Toe"),
+    ),
+    "daz-genesis-9": _family(
+        ("hip", "spine1", "spine2", "spine4", "neck1", "neck2", "head"),
+        ("{s}_shoulder", "{s}_upperarm", "{s}_forearm", "{s}_hand"),
+        ("{s}_thigh", "{s}_shin", "{s}_foot", "{s}_toes"),
+    ),
+    "character-creator": _family(
+        ("Hip", "Waist", "Spine01", "Spine02", "NeckTwist01", "NeckTwist02", "Head"),
+        ("{B}_Clavicle", "{B}_Upperarm", "{B}_Forearm", "{B}_Hand"),
+        ("{B}_Thigh", "{B}_Calf", "{B}_Foot", "{B}_ToeBase"),
+    ),
+    "xsens": _family(
+        ("Hips", "Chest", "Chest2", "Chest4", "Neck", None, "Head"),
+        ("{S}Collar", "{S}Shoulder", "{S}Elbow", "{S}Wrist"),
+        ("{S}Hip", "{S}Knee", "{S}Ankle", "{S}Toe"),
+    ),
+    "optitrack": _family(
+        ("Hip", "Ab", None, "Chest", "Neck", None, "Head"),
+        ("{B}Shoulder", "{B}UArm", "{B}FArm", "{B}Hand"),
+        ("{B}Thigh", "{B}Shin", "{B}Foot", "{B}Toe"),
+    ),
 }
 """Joint maps by family: body joint to source joint."""
 
@@ -84,20 +148,21 @@ NEEDED = frozenset({"Hips", *LIMBS, *LIMBS.values()})
 def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
     """The family whose joints the skeleton has, whatever stands before their names.
 
-    Joints that aren't limbs may be missing: they then follow their parents.
+    Letters' case, spaces, dots, dashes and underscores don't count, as programs change
+    them on the way. Joints that aren't limbs may be missing: they then follow their
+    parents.
 
     Raises:
         MotionError: If none fits; the text lists what is missing from the nearest.
     """
-    have = {name.lower(): name for name in source.names}
+    have = {_plain(name): name for name in reversed(source.names)}
     found: dict[str, dict[str, str]] = {}
     for family, joints in JOINT_MAPS.items():
-        hips = joints["Hips"].lower()
+        plain = {b: _plain(s) for b, s in joints.items()}
+        hips = plain["Hips"]
         prefixes = {name[: -len(hips)] for name in have if name.endswith(hips)} or {""}
         for prefix in sorted(prefixes):
-            mapped = {
-                b: have[prefix + s.lower()] for b, s in joints.items() if prefix + s.lower() in have
-            }
+            mapped = {b: have[prefix + s] for b, s in plain.items() if prefix + s in have}
             if len(mapped) > len(found.get(family, {})):
                 found[family] = mapped
     missing = {
@@ -112,12 +177,16 @@ def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
         raise MotionError.at(
             source.path,
             None,
-            f"unknown joints: not one of {', '.join(JOINT_MAPS)}; the nearest,"
-            f" {family}, lacks {lacks}",
+            f"unknown joints: of {len(JOINT_MAPS)} known skeletons the nearest, {family}, would"
+            f" have {lacks} too",
             "Pass a joint map (--joint-map FILE, joint_map={'Hips': 'your name', …}); the"
             f" file has {', '.join(source.names[:40])}",
         )
     return family, joints
+
+
+def _plain(name: str) -> str:
+    return name.lower().translate(_MARKS)
 
 
 def read_joint_map(path: str | pathlib.Path) -> dict[str, str]:

@@ -37,7 +37,7 @@ from ._maps import magnified
 from ._server import start_server
 from ._stage import Stage
 
-_MOTIONS = (".bvh", ".amc", ".npz", ".glb", ".gltf")
+_MOTIONS = (".bvh", ".amc", ".npz", ".glb", ".gltf", ".vrma")
 _MAP_SIZE = 192
 
 
