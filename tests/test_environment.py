@@ -4,10 +4,12 @@ import os
 import pathlib
 import subprocess
 import sys
+import threading
 
 import pytest
 
 from physxnet_jax._environment import cache_folder, keep_programs, keeps_programs
+from physxnet_jax.files import whole_file
 
 
 def test_what_is_set_already_stays(monkeypatch, tmp_path):
@@ -67,3 +69,25 @@ def test_only_commands_that_do_not_measure_compilation_keep_programs():
     assert not keeps_programs(["physxnet", "bench", "net"])
     assert not keeps_programs(["physxnet", "effects", "scene.toml"])
     assert not keeps_programs(["my_program.py", "dress"])
+
+
+def test_threads_write_one_file_side_by_side(tmp_path):
+    """Every writer has a part of its own; the file is one of them, whole."""
+    path, both = tmp_path / "a.txt", threading.Barrier(4)
+    failed = []
+
+    def write(text):
+        try:
+            with whole_file(path) as part:
+                part.write_text(text)
+                both.wait(10)
+        except Exception as error:
+            failed.append(error)
+
+    threads = [threading.Thread(target=write, args=(str(k) * 50,)) for k in range(4)]
+    for t in threads:
+        t.start()
+    for t in threads:
+        t.join()
+    assert not failed and path.read_text() in {str(k) * 50 for k in range(4)}
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]

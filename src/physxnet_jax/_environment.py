@@ -86,9 +86,15 @@ def keep_programs(environment: MutableMapping[str, str] | None = None) -> None:
     env.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
-def _processor() -> str:
+def processor_name() -> str:
+    """What the processor is called, as far as the system says it."""
+    return _processor("model name", "CPU part")
+
+
+def _processor(*keys: str) -> str:
     try:
         lines = pathlib.Path("/proc/cpuinfo").read_text().splitlines()
     except OSError:
         return platform.processor()
-    return next((x for x in lines if x.startswith(("flags", "Features"))), platform.processor())
+    keys = keys or ("flags", "Features")
+    return next((" ".join(x.split()) for x in lines if x.startswith(keys)), platform.processor())

@@ -4,6 +4,7 @@ import contextlib
 import math
 import os
 import pathlib
+import threading
 import zipfile
 from collections.abc import Iterator, Sequence
 from typing import Any
@@ -25,9 +26,9 @@ def whole_file(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
     """
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The suffix stays: some writers choose their format by it. Processes may write side
-    # by side what is the same.
-    part = path.with_name(f".part-{os.getpid()}-{path.name}")
+    # The suffix stays: some writers choose their format by it. Processes and threads may
+    # write side by side what is the same.
+    part = path.with_name(f".part-{os.getpid()}-{threading.get_ident()}-{path.name}")
     try:
         yield part
         part.replace(path)

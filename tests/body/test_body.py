@@ -10,9 +10,16 @@ import pytest
 from jax.test_util import check_grads
 from scipy.spatial.transform import Rotation
 
-from physxnet_jax.body import NUM_BODY_VERTICES, bone_directions, forward_kinematics
+from physxnet_jax.body import (
+    NUM_BODY_VERTICES,
+    bone_directions,
+    forward_kinematics,
+    load_body,
+)
 from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.garment import template
 from physxnet_jax.geometry import manifold_report
+from physxnet_jax.uv._atlas import _cached_atlas
 
 
 def numpy_body(shape, quaternions, root):
@@ -152,3 +159,23 @@ def test_any_tree_of_joints_is_followed(parents):
 def test_unknown_shape_parameters_are_refused(body):
     with pytest.raises(PhysXNetError, match="weight_up"):
         body.shape(wieght_up=1.0)
+
+
+def test_what_is_loaded_first_inside_a_traced_function_stays_usable(rest):
+    """Kept by a cache: what belonged to one program would break every other."""
+    kept = []
+
+    @jax.jit
+    def inside(x):
+        kept.extend([load_body.__wrapped__(), template.__wrapped__("top")])
+        kept.append(_cached_atlas.__wrapped__(32, 32))
+        kept.append(jnp.zeros(3))
+        return x
+
+    inside(jnp.ones(()))
+    leaves = jax.tree.leaves(kept[:-1])
+    assert len(leaves) > 20 and not any(isinstance(x, jax.core.Tracer) for x in leaves)
+    body = kept[0]
+    np.testing.assert_array_equal(body.rest_vertices(body.default_shape()), rest)
+    # The control: what is made there otherwise does.
+    assert isinstance(kept[-1], jax.core.Tracer)

@@ -2,6 +2,8 @@
 
 import dataclasses
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -247,3 +249,24 @@ def test_without_blender_the_way_to_it_is_told(monkeypatch):
     monkeypatch.setenv("PHYSXNET_BLENDER", "/nowhere/blender")
     with pytest.raises(MissingDependencyError, match="PHYSXNET_BLENDER"):
         find_blender()
+
+
+def test_a_rollout_has_one_name_in_every_process():
+    """What is kept is found again by the next process, whose memory lies elsewhere."""
+    code = (
+        "from physxnet_jax.simulation import ACCURACY, Scene, prepare_scene, XPBD\n"
+        "from physxnet_jax.simulation._resume import fingerprint\n"
+        "from physxnet_jax.garment import template\n"
+        "pad = [object() for _ in range({pad})]\n"
+        "scene = prepare_scene(Scene((template('bottom'),)))\n"
+        "print(fingerprint(scene, (XPBD({steps}, 2), True)))\n"
+    )
+
+    def name(pad, steps=8):
+        words = [sys.executable, "-c", code.format(pad=pad, steps=steps)]
+        return subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()[-1]
+
+    first = name(0)
+    assert len(first) == 64 and name(100_000) == first
+    # The control: another setting is another rollout.
+    assert name(0, steps=16) != first

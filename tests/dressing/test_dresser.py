@@ -19,7 +19,9 @@ from physxnet_jax.dressing import (
     start_clothing,
     with_shape,
 )
+from physxnet_jax.dressing._dresser import _check_pose
 from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.io import load_predictor
 from physxnet_jax.models import PAPER
 
 
@@ -174,3 +176,58 @@ def test_unknown_platforms_are_named(dresser, tmp_path):
 def test_garments_without_a_decoder_are_named():
     with pytest.raises(PhysXNetError, match="one of top, bottom, dress"):
         make_dresser(["cape"])
+
+
+def test_another_size_of_a_garment_is_the_same_program(dresser, motion):
+    """Sizes of one pattern share a compiled program, whatever is told of their files."""
+    base = dresser.garments[0]
+    wide = base.mesh.replace(vertices=base.mesh.vertices * jnp.float32([[1.03, 1.0, 1.03]]))
+    other = make_dresser([dataclasses.replace(base, mesh=wide)], weights=dresser.predictor)
+    one = make_dresser([base], weights=dresser.predictor)
+    noted = dataclasses.replace(other, notes=type(other.notes)(["too wide"]))
+    assert noted.notes[0] == "too wide" and tuple(one.notes) != tuple(noted.notes)
+    assert jax.tree.structure(one) == jax.tree.structure(noted)
+    counted = jax.jit(lambda d: d.wearables[0].rest.sum())
+    counted(one), counted(noted)
+    assert counted._cache_size() == 1
+
+
+def test_a_clip_of_no_frames_is_refused(dresser, motion):
+    q, p = motion
+    with pytest.raises(ValueError, match="no frames"):
+        clothe(dresser, q[:0], p[:0], fps=30.0)
+
+
+def test_poses_of_another_skeleton_are_refused_also_under_jit(dresser, motion):
+    q, p = motion
+    wrong = [(q[:, :22], p), (jnp.tile(q, (1, 2, 1)), p)]
+    for rotations, root in wrong:
+        with pytest.raises(ValueError, match="31 joints"):
+            jax.jit(clothe, static_argnames="fps")(dresser, rotations, root, fps=30.0)
+    # Where types aren't checked, these come this far.
+    for rotations, root in [*wrong, (q, p[:2]), (q[0], p[0]), (q[None], p[None])]:
+        with pytest.raises(ValueError, match="31 joints"):
+            _check_pose(dresser.body, rotations, root, ("frames",))
+    with pytest.raises(ValueError, match="31 joints"):
+        start_clothing(dresser, q[0, :24], p[0])
+    stream = start_clothing(dresser, q[0], p[0])
+    with pytest.raises(ValueError, match="31 joints"):
+        clothe_frame(dresser, stream, q[0, :24], p[0], fps=30.0)
+    with pytest.raises(ValueError, match=r"9 parameters, .*height"):
+        with_shape(dresser, jnp.ones(5))
+
+
+def test_weights_may_be_a_predictor_and_one_garment_a_word(dresser, motion):
+    known = dresser.predictor
+    clip = dress("walk", "bottom", weights=known, frames=2)
+    again = dress("walk", ["bottom"], frames=2)
+    np.testing.assert_array_equal(clip.garments[0].positions, again.garments[0].positions)
+
+
+def test_weights_are_loaded_inside_a_traced_function_too(motion):
+    @jax.jit
+    def total(x):
+        return x * jax.tree.leaves(load_predictor("nano").state)[0].sum()
+
+    want = float(jax.tree.leaves(load_predictor("nano").state)[0].sum())
+    assert float(total(jnp.ones(()))) == pytest.approx(want, rel=1e-5)

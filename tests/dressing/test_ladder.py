@@ -5,8 +5,10 @@ import json
 import pytest
 from hypothesis import given, settings, strategies as st
 
+from physxnet_jax._environment import processor_name
 from physxnet_jax.cli import main
 from physxnet_jax.dressing import Rung, calibrate, dress, load_ladder, pick_rung, worn_key
+from physxnet_jax.dressing._ladder import _Clock
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import TEMPLATES
 from physxnet_jax.io import list_weights
@@ -99,6 +101,16 @@ def test_nothing_is_timed_twice_and_another_machine_is(tmp_path):
     for broken in ("{", "[]", json.dumps({**here, "times": {"lbs": 1.0}})):
         path.write_text(broken)
         assert calibrate(rungs, worn[:1], path=path, frames=17)["lbs"]["bottom"] > 0
+
+
+def test_what_another_process_has_timed_is_kept(tmp_path):
+    path = tmp_path / "times.json"
+    one, other = (_Clock(path, 16) for _ in range(2))
+    one.time_of(rung("lbs", 20.0), ("bottom",))
+    other.time_of(rung("lbs", 20.0), ("top",))
+    kept = json.loads(path.read_text())
+    assert set(kept["times"]["lbs"]) == {"bottom", "top"}
+    assert kept["machine"]["processor"] == processor_name()
 
 
 def test_what_follows_the_network_is_timed_once_for_all(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import fast_simplification
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,7 @@ from physxnet_jax.dressing import clothe, clothe_frame, make_dresser, start_clot
 from physxnet_jax.dressing._dress import unbound_wearable
 from physxnet_jax.dressing._layers import Layer, inside_out, layer_height, lift_off, make_layers
 from physxnet_jax.garment import grid_faces, template
-from physxnet_jax.geometry import Smoothing
+from physxnet_jax.geometry import Smoothing, closest_points, make_mesh
 from physxnet_jax.motion import load_motion
 
 N = 9
@@ -87,6 +88,35 @@ def test_the_order_is_trousers_dresses_tops_and_else_as_named():
     other = [dataclasses.replace(worn[0], mesh=turned), *worn[1:]]
     (again,) = make_layers(body, rest, wearables, other)
     np.testing.assert_array_equal(again.faces, layers[0].faces)
+
+
+def test_a_top_is_kept_off_trousers_that_lie_over_others():
+    """The second trousers aren't tucked in: they are lifted off the first."""
+    body = load_body()
+    rest = body.rest_vertices(body.default_shape())
+    worn = [template(t) for t in ("bottom", "bottom", "top")]
+    wearables = [unbound_wearable(body, rest, g) for g in worn]
+    layers = make_layers(body, rest, wearables, worn)
+    assert [(x.inner, x.outer) for x in layers] == [(0, 1), (1, 2)]
+
+
+def test_coarse_triangles_are_as_near_as_fine_ones():
+    """A dress of few triangles beneath a top: what is near its surface is in the layer."""
+    body = load_body()
+    rest = body.rest_vertices(body.default_shape())
+    top, dress = template("top"), template("dress")
+    fine = [unbound_wearable(body, rest, g) for g in (dress, top)]
+    (known,) = make_layers(body, rest, fine, [dress, top])
+    points, faces = fast_simplification.simplify(
+        np.array(dress.mesh.vertices), np.array(dress.mesh.faces), target_count=150
+    )
+    mesh = make_mesh(np.float32(points), faces.astype(np.int32))
+    coarse = dataclasses.replace(dress, mesh=mesh)
+    worn = dataclasses.replace(fine[0], rest=mesh.vertices)
+    (layer,) = make_layers(body, rest, [worn, fine[1]], [coarse, top])
+    away = np.sqrt(closest_points(mesh, fine[1].rest).squared_distance)
+    missed = np.setdiff1d(np.flatnonzero(away < 0.045), layer.rows)
+    assert len(known.rows) > 1000 and len(missed) < 0.002 * len(layer.rows)
 
 
 def test_of_two_alike_the_second_stays_over_the_first_live_and_in_clips():

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from physxnet_jax.dressing import (
     make_patch,
@@ -16,7 +17,7 @@ from physxnet_jax.dressing import (
     unbound_wearable,
 )
 from physxnet_jax.garment import template
-from physxnet_jax.geometry import each_frame
+from physxnet_jax.geometry import each_frame, mesh_edges
 from physxnet_jax.models import skin_wearable
 from physxnet_jax.motion import clip_transforms, load_motion
 
@@ -161,4 +162,20 @@ def test_tucking_in_leaves_room_between_least_and_most(body, rest):
     coarse = [dataclasses.replace(p, least=p.least + 0.01) for _, p in pairs]
     top, bottom = tuck_in(coarse, [w for w, _ in pairs])
     assert bool((bottom.most >= bottom.least).all())
-    assert float(top.least.min()) > float(bottom.least.max())
+    away = KDTree(np.asarray(pairs[1][0].rest)).query(np.asarray(pairs[0][0].rest))[0]
+    assert float(top.least[away < 0.04].min()) > float(bottom.least.max())
+
+
+def test_a_top_far_from_trousers_is_as_it_is_without_them(body, rest):
+    pairs = [fitted(body, rest, t) for t in ("top", "bottom")]
+    alone = pairs[0][1].least
+    (top, _) = tuck_in([p for _, p in pairs], [w for w, _ in pairs])
+    away = KDTree(np.asarray(pairs[1][0].rest)).query(np.asarray(pairs[0][0].rest))[0]
+    assert (away > 0.08).mean() > 0.5
+    np.testing.assert_array_equal(top.least[away > 0.08], alone[away > 0.08])
+    # The control: over the trousers it keeps farther off.
+    assert float((top.least - alone)[away < 0.03].min()) > 0.003
+    # Nor is there a step between.
+    edges = mesh_edges(np.asarray(template("top").mesh.faces)).vertices
+    more = np.asarray(top.least - alone)
+    assert np.abs(more[edges[:, 0]] - more[edges[:, 1]]).max() < 0.006

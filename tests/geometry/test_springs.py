@@ -223,3 +223,27 @@ def test_lengths_of_another_shape(cloth):
     told = jax.jit(lambda s: relax(springs.at_rest(s * wider), wider, 4).sum())
     slope = jax.grad(told)(jnp.ones(()))
     assert np.isfinite(float(slope))
+
+
+def test_far_from_the_origin_lengths_are_kept_as_well(cloth):
+    """A kilometre away neighbours differ by what float32 leaves of them, no more."""
+    vertices, _, springs = cloth
+    rng = np.random.default_rng(0)
+    x = jnp.asarray(vertices + 0.004 * rng.normal(size=vertices.shape).astype(np.float32))
+    away = jnp.float32([[1000.0, 0.0, 500.0]])
+    far = x + away
+    near = settled(springs, far - away, steps=8)
+    np.testing.assert_allclose(settled(springs, far, steps=8) - away, near, atol=1e-4)
+
+
+def test_second_derivatives_are_finite(cloth):
+    """Newton's methods and penalties on gradients ask for them."""
+    vertices, _, springs = cloth
+    x = jnp.asarray(vertices * np.float32([1.05, 1.0, 0.95]))
+    way = jax.random.normal(jax.random.key(0), x.shape)
+
+    def total(y):
+        return jnp.sum(relax(springs, y, 3) ** 2)
+
+    _, second = jax.jit(lambda y: jax.jvp(jax.grad(total), (y,), (way,)))(x)
+    assert bool(jnp.isfinite(second).all()) and float(jnp.abs(second).max()) > 0.1

@@ -86,6 +86,9 @@ def test_a_rig_is_moved_by_somebody_elses_motion(body, rest, tmp_path):
         person.positions[:, person.faces] + [0.0, lowest, 0.0], true, atol=2e-3
     )
     assert bind is not None and person.positions[..., 1].min() == pytest.approx(0.0, abs=1e-5)
+    # A glTF tells its times: no rate that is told of the motion changes its speed.
+    same = read_character(path, fps=10.0, source_fps=60.0, motion=walk)[0]
+    np.testing.assert_array_equal(same.positions, person.positions)
     # The control: without a motion he stands.
     still = read_character(path, fps=10.0)[0]
     assert len(still.positions) == 1

@@ -14,7 +14,7 @@ from physxnet_jax.garment import template
 from physxnet_jax.geometry import make_mesh
 from physxnet_jax.io import fit_garment, inspect_garment, load_garment, read_obj, write_obj
 from physxnet_jax.io._drape import drape
-from physxnet_jax.io._garment import carried
+from physxnet_jax.io._garment import carried, guess_template, place_on_body
 from physxnet_jax.io._inspect import _like
 
 
@@ -276,3 +276,32 @@ def test_a_template_is_reported_as_its_file_is(tmp_path, name):
     for field in ("distance", "hangs", "longest_edge", "inside"):
         assert getattr(named, field) == pytest.approx(getattr(read, field), abs=1e-6), field
     assert named.warning is None and read.warning is None and named.distance > 0.005
+
+
+def test_legs_are_trousers_whatever_is_above_or_closed_below(data_dir, trousers):
+    """Overalls and tights with feet: two tubes, though they reach to the neck or have no opening."""
+    raw = read_obj(data_dir / "garments/helper_tights.obj")
+    v, _, _ = place_on_body(data_dir / "tights.obj", raw.vertices, load_body())
+    assert guess_template(v, raw.faces) == "bottom"
+    low = (v[raw.faces, 1] < 0.1).all(axis=1)
+    assert guess_template(v, raw.faces[low]) == "bottom"
+    # The controls: a dress, trousers, a top.
+    for name in ("dress", "bottom", "top"):
+        mesh = template(name).mesh
+        assert guess_template(np.asarray(mesh.vertices), np.asarray(mesh.faces)) == name
+
+
+@pytest.mark.parametrize("what", ["backwards", "too high"])
+def test_a_garment_that_lies_elsewhere_is_sent_to_its_place(tmp_path, what):
+    """Lifted out where it lies it would be ruined."""
+    mesh = template("top").mesh
+    v = np.asarray(mesh.vertices, float)
+    turned = v * [-1.0, 1.0, -1.0] if what == "backwards" else v + [0.0, 0.13, 0.0]
+    path = saved(tmp_path, "a.obj", turned, np.asarray(mesh.faces))
+    found = inspect_garment(path)
+    assert "--like top" in found.command and any("elsewhere" in p for p in found.problems)
+    _, after = fit_garment(path, tmp_path / "b.obj", like="top")
+    assert after.inside < 0.02 and not any("elsewhere" in p for p in after.problems)
+    # The control: deep in the body where it belongs it isn't.
+    thin = saved(tmp_path, "c.obj", v * [0.97, 1.0, 0.9], np.asarray(mesh.faces))
+    assert "--like" not in (inspect_garment(thin).command or "")

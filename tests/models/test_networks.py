@@ -394,7 +394,8 @@ def test_networks_averaged_answer_the_mean_of_their_answers(worn):
     other = dataclasses.replace(
         two, normalisation=dataclasses.replace(two.normalisation, velocity=jnp.float32(2.0))
     )
-    for wrong in ([], [one, other], [one, dataclasses.replace(two, mirrored=True)]):
+    ways = [dataclasses.replace(two, **way) for way in ({"mirrored": True}, {"relaxation": 8})]
+    for wrong in ([], [one, other], [one, ways[0]], [one, ways[1]], [ways[1], one]):
         with pytest.raises(ValueError, match=r"no predictors|different"):
             average_networks(wrong)
     with pytest.raises(ValueError, match="before their batch norm is folded"):

@@ -221,3 +221,18 @@ def test_resampling_keeps_duration(data_dir):
     motion = load_motion(data_dir / "mocap/amc/002_04.amc")
     slow = resample(motion, 24.0)
     assert abs((slow.num_frames - 1) / 24 - (motion.num_frames - 1) / motion.fps) < 1 / 24
+
+
+def test_blank_lines_and_tabs_of_other_exporters_are_read(tmp_path):
+    plain, odd = tmp_path / "a.bvh", tmp_path / "b.bvh"
+    plain.write_text(BVH)
+    odd.write_text("\n \n" + BVH.replace("Frame Time:", "Frame\tTime: ").replace("\n", "\r\n"))
+    np.testing.assert_array_equal(read_bvh(odd).rotations, read_bvh(plain).rotations)
+    odd.write_text("\n\nHALLO\n")
+    with pytest.raises(MotionError, match=r"b\.bvh:3.*'HALLO' where HIERARCHY"):
+        read_bvh(odd)
+
+
+def test_a_true_rate_is_of_files_alone():
+    with pytest.raises(MotionError, match="'walk' is computed at any rate"):
+        load_motion("walk", fps=30.0, source_fps=60.0)

@@ -196,6 +196,54 @@ def test_a_joint_map_of_ones_own_is_read_from_a_file(body, rest, tmp_path):
     assert limbs < 0.1
 
 
+def test_a_map_of_a_few_names_completes_what_is_known(body, rest, tmp_path):
+    """Four renamed joints, told; the spine and the neck are still known by their names."""
+    walk = procedural_clip("walk", fps=10.0)
+    odd = {"LeftUpLeg": "thighA", "RightUpLeg": "thighB", "LeftArm": "armA", "RightArm": "armB"}
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(body, rest, walk, JOINT_MAPS["mixamo"] | odd))
+    again = load_motion(path, joint_map=odd)
+    whole = tmp_path / "b.bvh"
+    whole.write_text(bvh(body, rest, walk, JOINT_MAPS["mixamo"]))
+    np.testing.assert_allclose(again.rotations, load_motion(whole).rotations, atol=1e-6)
+    with pytest.raises(MotionError, match=r"the joint map lacks LeftArm, RightArm\. Map"):
+        load_motion(path, joint_map={k: v for k, v in odd.items() if "Leg" in k})
+    with pytest.raises(MotionError, match="has Tail, which the body hasn't"):
+        load_motion(path, joint_map=odd | {"Tail": "armA"})
+
+
+def test_the_way_from_a_t_pose_isnt_gone(body, rest, tmp_path):
+    """A conversion that blends from its T-pose in five frames: the clip begins as it goes on."""
+    walk = procedural_clip("walk", fps=30.0)
+    q = np.asarray(walk.rotations, np.float64)
+    t_pose = np.asarray(body.t_pose(body.default_shape()), np.float64)
+    share = np.array([0.0, 0.5, 0.8, 0.92, 0.97])[:, None, None]
+    blend = (1 - share) * t_pose * np.sign((t_pose * q[:5]).sum(-1, keepdims=True)) + share * q[:5]
+    blend /= np.linalg.norm(blend, axis=-1, keepdims=True)
+    blend[0, 0] = [1.0, 0.0, 0.0, 0.0]
+    mixed = make_motion(np.concatenate([blend, q[5:]]), walk.root, 30.0)
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(body, rest, mixed, JOINT_MAPS["cmu-motionbuilder"]))
+    again = np.asarray(load_motion(path).rotations)
+    assert len(again) == len(q) - 1
+    turned = 2 * np.degrees(np.arccos(np.clip(np.abs((again[1:] * again[:-1]).sum(-1)), 0, 1)))
+    usual = 2 * np.degrees(np.arccos(np.clip(np.abs((q[1:] * q[:-1]).sum(-1)), 0, 1)))
+    assert turned.max() < 1.6 * usual.max() and (turned[:1] < 0.1).all()
+    # The control: a clip that begins with its first step is left alone.
+    path.write_text(
+        bvh(
+            body,
+            rest,
+            make_motion(
+                np.concatenate([t_pose[None], q]), np.concatenate([walk.root[:1], walk.root]), 30.0
+            ),
+            JOINT_MAPS["cmu-motionbuilder"],
+        )
+    )
+    same = load_motion(path)
+    assert same.num_frames == len(q) and limbs_apart(body, rest, walk, same) < 0.2
+
+
 @pytest.mark.parametrize("text", ["", "Hips = 3\n", 'Hip = "a"\n', "not toml", '[Hips]\na = "b"\n'])
 def test_broken_joint_maps_are_refused(tmp_path, text):
     path = tmp_path / "names.toml"

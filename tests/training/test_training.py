@@ -375,3 +375,45 @@ def test_pictures_of_maps_show_zero_as_grey():
     assert picture.shape == (4, 12, 3)
     assert (picture[:, :4] == 127).all() and (picture[:, 4:8] == 255).all()
     assert (picture[:, 8:] == 0).all()
+
+
+def test_what_fills_the_last_batch_counts_for_nothing(monkeypatch):
+    """Held-out frames of which the last is bad: the mean is that of the frames."""
+    from types import SimpleNamespace
+
+    from physxnet_jax.training import _loop
+
+    config = dataclasses.replace(CONFIG, batch=8)
+    templates = config.model.templates
+    errors = np.ones(25)
+    errors[-1] = 10.0
+
+    def take(frames, index):
+        return {"index": index} | {f"weight_{t}": np.ones((len(index), 5)) for t in templates}
+
+    def look(state, batch):
+        losses = {}
+        for t in templates:
+            share = batch[f"weight_{t}"].sum(axis=1)
+            losses[t] = (share * errors[batch["index"]]).sum() / share.sum()
+        return losses, {t: (np.zeros((8, 2, 2, 3)),) * 2 for t in templates}
+
+    monkeypatch.setattr(_loop, "take", take)
+    found, _ = _loop._validate(config, SimpleNamespace(look=look), None, range(25))
+    assert found["validation_mm"] == pytest.approx(errors[::3].mean())
+
+
+def test_the_mean_of_the_accuracy_goes_on_where_it_was():
+    whole, first = Players(), Players()
+    rng = np.random.default_rng(0)
+    noted = []
+    for step in range(60):
+        seen = {"discriminator_accuracy": float(rng.uniform())}
+        want = whole.update(seen)
+        if step < 40:
+            noted.append({"step": float(step), **first.update(seen)})
+            # What was written after the last checkpoint is done again.
+            rest = Players([*noted, {"step": 99.0, "discriminator_accuracy_mean": 0.0}], step)
+        else:
+            got = rest.update(seen)
+    assert got == want

@@ -93,7 +93,16 @@ class Body:
         )
 
     def rest_vertices(self, shape: Float[Array, " shapes"]) -> Float[Array, "all 3"]:
-        """Rest positions [m] of all vertices, helpers included."""
+        """Rest positions [m] of all vertices, helpers included.
+
+        Raises:
+            ValueError: Another number of parameters than ``shape_names``.
+        """
+        if shape.shape != (len(self.shape_names),):
+            raise ValueError(
+                f"a shape of {shape.shape}; the body has {len(self.shape_names)} parameters,"
+                f" {', '.join(self.shape_names)}. Make one by body.shape(name=value)."
+            )
         return _rest_vertices(self.bases, self.deltas, shape)
 
     def joint_positions(
@@ -221,7 +230,10 @@ def load_body() -> Body:
             f"{ASSET}: sha256 is {digest}, expected {ASSET_SHA256}. Reinstall the package."
         )
     with importlib.resources.as_file(resource) as path, np.load(path) as data:
-        return _from_arrays({name: data[name] for name in data.files})
+        arrays = {name: data[name] for name in data.files}
+    # What is kept mustn't belong to the program that happens to be traced.
+    with jax.ensure_compile_time_eval():
+        return _from_arrays(arrays)
 
 
 def _from_arrays(data: dict[str, np.ndarray]) -> Body:

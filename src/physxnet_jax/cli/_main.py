@@ -1,5 +1,6 @@
 """Entry point: one sentence and a fix for every error, exit code 2."""
 
+import os
 import pathlib
 import sys
 from collections.abc import Sequence
@@ -68,6 +69,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         Console(stderr=True, soft_wrap=True).print(f"physxnet: {error}", style="red", markup=False)
         return 1 if isinstance(error, BrokenInstallError) else 2
+    except BrokenPipeError:
+        # Who reads has enough; nor is there anybody to tell at the end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except OSError as error:
         if command.debug:
             raise

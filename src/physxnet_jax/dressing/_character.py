@@ -91,7 +91,8 @@ def load_character(
         path: Animated glTF (skin or morph targets), USD, PC2 or MDD with its OBJ, or npz,
             see `read_character`.
         fps: Frames a second.
-        source_fps: True rate of a file that doesn't say it.
+        source_fps: True rate of a file that doesn't say it, or says it wrongly: of
+            `motion`, where that is a file.
         mesh: Name of the body's mesh in the file.
         frames: Keep only this many frames.
         motion: What moves the person's skin instead of the file's own animation: a clip,
@@ -107,7 +108,7 @@ def load_character(
         PhysXNetError: What can't be read, or no person whom the body fits.
     """
     if isinstance(motion, str | pathlib.Path):
-        motion = load_motion(motion, fps=fps)
+        motion = load_motion(motion, fps=fps, source_fps=source_fps)
     if motion is not None:
         motion = motion if motion.fps == fps else resample(motion, fps)
         motion = Motion(motion.rotations[:frames], motion.root[:frames], motion.fps, motion.name)

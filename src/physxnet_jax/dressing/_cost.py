@@ -43,8 +43,9 @@ class Cost:
         ms_backward: The vertices and the gradient of their squares with respect to
             rotations, root and the network's parameters, a frame [ms]; NaN if not asked for.
         cold_s: The first call, compilation included [s].
-        params: Numbers the network has learned.
-        flops: Of a call, over its frames, as the compiler counts them.
+        params: Numbers the network has learned, and statistics of its batch norm.
+        flops: Of a call, as the compiler counts them; NaN with push-out or relaxation,
+            whose loops it counts once.
         weights_mb: Size of the weights' file [MB].
         peak_mb: Memory of a call: arguments, results and what is between [MB].
         backward_mb: The same of the gradient.
@@ -246,9 +247,13 @@ def clothing_cost(
     return {
         "ms_per_frame": _median(call, seconds) / batch,
         "cold_s": cold,
-        "flops": _flops(program),
+        "flops": _flops(program) if _without_loops(dresser) else math.nan,
         "peak_mb": _peak(program) / 1e6,
     }
+
+
+def _without_loops(dresser: Dresser) -> bool:
+    return not dresser.resolve and not dresser.predictor.relaxation
 
 
 def _gradient(dresser: Dresser, motion: Motion, batch: int) -> dict[str, float]:

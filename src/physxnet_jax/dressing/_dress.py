@@ -90,7 +90,7 @@ def dress(
     accuracy: str = "standard",
     fps: float | int = 30.0,
     frames: int | None = None,
-    weights: str | pathlib.Path = DEFAULT,
+    weights: str | pathlib.Path | Predictor = DEFAULT,
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
     include_body: bool = True,
@@ -109,7 +109,7 @@ def dress(
         accuracy: Of ``simulate``: ``draft``, ``standard`` or ``fine``.
         fps: Frames a second of the result.
         frames: Keep only this many frames.
-        weights: Name or folder of network weights.
+        weights: Name or folder of network weights, or a predictor.
         body: The body; the built-in one by default.
         shape: Shape parameters; the default shape if omitted.
         include_body: Put the body's mesh into the result.
@@ -168,13 +168,14 @@ def dress(
     predictor = None
     if method == "network":
         with watch("weights"):
-            predictor = fold_batch_norm(load_predictor(weights))
+            known = weights if isinstance(weights, Predictor) else load_predictor(weights)
+            predictor = fold_batch_norm(known)
             predictor = fit_surface(predictor, body, rest, shape)
         with watch("binding"):
             wearables = [bound_wearable(predictor, body, rest, g) for g in garments]
         for w in wearables:
-            hits[w.name] = w.binding.hit_rate
-            fallbacks[w.name] = w.binding.fallbacks
+            hits[w.name] = float(w.binding.hit_rate)
+            fallbacks[w.name] = int(w.binding.fallbacks)
     else:
         wearables = [unbound_wearable(body, rest, g) for g in garments]
     patches = tuck_in(
@@ -274,7 +275,9 @@ def unbound_wearable(body: Body, rest: Float[Array, "all 3"], garment: Garment) 
     """A garment for skinning alone, tied to no atlas."""
     n = garment.num_vertices
     rows = Transference(jnp.zeros((n, 3), jnp.int32), jnp.zeros((n, 3)), jnp.zeros((n,), bool))
-    none = Binding(rows, jnp.zeros((n, 4), jnp.int32), jnp.zeros((n, 4)), 1.0, 0, 0)
+    count = jnp.zeros((), jnp.int32)
+    texel = jnp.zeros((n, 4), jnp.int32)
+    none = Binding(rows, texel, jnp.zeros((n, 4)), jnp.ones(()), count, count)
     worn = garment.rest_vertices(rest)
     return Wearable(
         worn,

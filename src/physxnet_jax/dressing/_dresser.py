@@ -33,6 +33,16 @@ from ._push_out import SkinPatch, make_patch, push_out, tuck_in
 Precision = Literal["float32", "bfloat16"]
 
 
+class _Notes(tuple[str, ...]):
+    """What is told of files: all are alike to a program, which isn't compiled again for them."""
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Notes) or super().__eq__(other)
+
+    def __hash__(self) -> int:
+        return 0
+
+
 @pytree
 @dataclasses.dataclass(frozen=True)
 class Dresser:
@@ -91,6 +101,20 @@ def _clothed(vertices: dict[str, Array]) -> Clothed:
     return Clothed(vertices, functools.reduce(jnp.logical_and, finite))
 
 
+def _check_pose(body: Body, rotations: Array, root: Array, axes: tuple[str, ...]) -> None:
+    """Shapes alone: fine under `jax.jit`."""
+    many = rotations.shape[: len(axes)]
+    wanted = (*many, len(body.parents), 4), (*many, 3)
+    got = rotations.shape, root.shape
+    if got != wanted or rotations.ndim != len(axes) + 2:
+        names = ", ".join((*axes, "joints", "4"))
+        raise ValueError(
+            f"rotations [{names}] have the shape {got[0]} and root {got[1]}; the body has"
+            f" {len(body.parents)} joints, so {wanted[0]} and {wanted[1]} are expected. Retarget a"
+            " motion of another skeleton (load_motion), or add the axis of frames."
+        )
+
+
 def make_dresser(
     wear: Sequence[Garment | str | pathlib.Path] = ("top", "bottom"),
     *,
@@ -128,7 +152,7 @@ def make_dresser(
     )
     layers = make_layers(body, rest, wearables, garments)
     return Dresser(
-        body, rest, predictor, wearables, patches, layers, tuple(garments), resolve, notes
+        body, rest, predictor, wearables, patches, layers, tuple(garments), resolve, _Notes(notes)
     )
 
 
@@ -144,8 +168,9 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
         shape: Shape parameters, see `Body.shape`.
 
     Raises:
-        ValueError: A dress by a network of the paper's family, whose offsets begin on a
-            body with joined legs; make a dresser for the shape instead.
+        ValueError: Another number of parameters; a dress by a network of the paper's
+            family, whose offsets begin on a body with joined legs: make a dresser for the
+            shape instead.
 
     Example:
         >>> person = make_dresser(["bottom"])
@@ -200,6 +225,9 @@ def clothe(
     Returns:
         Vertices of each garment, and which frames are usable.
 
+    Raises:
+        ValueError: A clip of no frames, or of another skeleton than the body's.
+
     Example:
         >>> from physxnet_jax.motion import load_motion
         >>> motion = load_motion("walk", fps=30)
@@ -209,6 +237,9 @@ def clothe(
         >>> cloth["bottom"].shape
         (2, 2726, 3)
     """
+    _check_pose(dresser.body, rotations, root, ("frames",))
+    if rotations.shape[0] == 0:
+        raise ValueError("a clip of no frames; clothe takes one or more.")
     world, shift = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(
         rotations, root
     )
@@ -236,7 +267,11 @@ def start_clothing(
         dresser: From `make_dresser`.
         rotations: Joint rotations of the first frame.
         root: Position of the root joint [m].
+
+    Raises:
+        ValueError: Of another skeleton than the body's.
     """
+    _check_pose(dresser.body, rotations, root, ())
     world, shift = dresser.body.transforms(dresser.rest, rotations, root)
     return start_stream(dresser.predictor, world, shift)
 
@@ -261,7 +296,11 @@ def clothe_frame(
 
     Returns:
         The stream for the next frame, and this frame's clothes.
+
+    Raises:
+        ValueError: Of another skeleton than the body's.
     """
+    _check_pose(dresser.body, rotations, root, ())
     world, shift = dresser.body.transforms(dresser.rest, rotations, root)
     stream, raw = stream_frame(dresser.predictor, dresser.wearables, stream, world, shift, fps)
     worn = list(raw)

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from .._environment import cache_folder
+from .._environment import cache_folder, processor_name
 from ..errors import PhysXNetError
 from ..files import whole_file
 from ..garment import TEMPLATES, Template
@@ -174,6 +174,11 @@ class _Clock:
 
     def _keep(self, known: dict[str, float], key: str, ms: float) -> None:
         known[key] = ms
+        # Another process may have timed something meanwhile.
+        kept = _read(self._path)
+        if kept.get("machine") == self._machine:
+            for name, times in kept["times"].items():
+                self.times[name] = times | self.times.get(name, {})
         with whole_file(self._path) as part:
             kept = {"machine": self._machine, "times": self.times}
             part.write_text(json.dumps(kept, indent=1) + "\n")
@@ -253,6 +258,7 @@ def _machine() -> dict[str, Any]:
     return {
         "device": jax.devices()[0].device_kind,
         "cores": os.cpu_count(),
+        "processor": processor_name(),
         "jax": jax.__version__,
         "timed": _TIMED,
         "version": importlib.metadata.version("physxnet-jax"),

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -11,7 +12,14 @@ from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body
 from ..garment import Garment
-from ..geometry import Smoothing, each_frame, gaussian_smoothing, vertex_normals
+from ..geometry import (
+    Smoothing,
+    TriMesh,
+    closest_among,
+    each_frame,
+    gaussian_smoothing,
+    vertex_normals,
+)
 from ..models import Wearable
 from ..typing import pytree
 from ._push_out import least_height
@@ -67,8 +75,8 @@ def make_layers(
     """Which garment lies over which, in the order in which they are to be resolved.
 
     Trousers are innermost, then dresses, then tops; of two of one kind the one named
-    first is beneath. Trousers are pressed beneath a top by `tuck_in` and are no layer
-    of it.
+    first is beneath. Innermost trousers are pressed beneath a top by `tuck_in` and are no
+    layer of it.
 
     Args:
         body: The body.
@@ -82,7 +90,9 @@ def make_layers(
     out = []
     for k, outer in enumerate(order):
         for inner in order[:k]:
-            if (wearables[inner].template, wearables[outer].template) == ("bottom", "top"):
+            pair = (wearables[inner].template, wearables[outer].template)
+            # Trousers over trousers were lifted off, out of where they were tucked in.
+            if pair == ("bottom", "top") and all(layer.outer != inner for layer in out):
                 continue
             layer = _make_layer(skin, wearables, garments, inner, outer)
             if layer is not None:
@@ -101,9 +111,11 @@ def _make_layer(
     faces = np.asarray(garments[inner].mesh.faces)
     middles = below[faces].mean(axis=1)
     k = min(_PATCH, len(faces))
-    away, near = KDTree(middles).query(above, k=k)
-    away, near = away.reshape(len(above), k), near.reshape(len(above), k)
-    rows = np.flatnonzero(away[:, 0] < _REACH)
+    near = KDTree(middles).query(above, k=k)[1].reshape(len(above), k)
+    # Middles of large triangles may be far away while they are near.
+    mesh = TriMesh(jnp.asarray(below), jnp.asarray(faces))
+    hit = jax.jit(closest_among)(mesh, jnp.asarray(above), jnp.asarray(near.astype(np.int32)))
+    rows = np.flatnonzero(np.asarray(hit.squared_distance) < _REACH**2)
     if len(rows) == 0:
         return None
     # Some files have their faces inside out: outward is away from the skin.

@@ -71,6 +71,8 @@ def worn_garments(
     """
     taken = {"body"}
     garments, notes = [], []
+    # One word is a sequence of letters.
+    wear = [wear] if isinstance(wear, str) else wear
     for word in wear:
         if isinstance(word, Garment):
             garment = word

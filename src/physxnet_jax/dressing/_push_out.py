@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -25,6 +26,8 @@ from ._skirt import SkirtPatch, make_skirt_patch, skin_foot, skirt_lift, skirt_m
 _PATCH = 20
 # Least height of cloth above the skin; of a top above trousers; most of those beneath it [m].
 _GAP, _ABOVE, _BENEATH = 0.005, 0.011, 0.006
+# Tops are over trousers that are this near at rest, and no longer from here on [m].
+_ON, _OVER = 0.04, 0.08
 # Long edges cut corners off a limb of this radius; vertices rise by as much, within reason [m].
 _LIMB, _RISE = 0.05, 0.015
 # Nothing is lifted from deeper than this [m].
@@ -128,6 +131,10 @@ def tuck_in(patches: Sequence[SkinPatch], wearables: Sequence[Wearable]) -> tupl
 
     Where a top covers them at rest, trousers keep near the skin and the top keeps off it.
     Elsewhere nothing changes, and a garment worn alone isn't touched.
+
+    Args:
+        patches: Of what is worn.
+        wearables: What is worn, in the same order.
     """
     tops = [w for w in wearables if w.template == "top"]
     if not tops or all(w.template != "bottom" for w in wearables):
@@ -136,6 +143,9 @@ def tuck_in(patches: Sequence[SkinPatch], wearables: Sequence[Wearable]) -> tupl
     pairs = list(zip(patches, wearables, strict=True))
     beneath = [jnp.maximum(p.least, _BENEATH) for p, w in pairs if w.template == "bottom"]
     above = float(max(b.max() for b in beneath)) + _ABOVE - _BENEATH
+    waist = KDTree(
+        np.concatenate([np.asarray(w.rest) for w in wearables if w.template == "bottom"])
+    )
     out = []
     for patch, w in pairs:
         below = jnp.maximum(hem - w.rest[:, 1], 0.0)
@@ -145,7 +155,11 @@ def tuck_in(patches: Sequence[SkinPatch], wearables: Sequence[Wearable]) -> tupl
                 patch, most=jnp.maximum(patch.least, _BENEATH) + 2.0 * below
             )
         elif w.template == "top":
-            patch = dataclasses.replace(patch, least=jnp.maximum(patch.least, above))
+            # Released again where no trousers are beneath.
+            away = waist.query(np.asarray(w.rest))[0]
+            share = jnp.asarray(np.clip((_OVER - away) / (_OVER - _ON), 0, 1), jnp.float32)
+            more = jnp.maximum(above - patch.least, 0.0)
+            patch = dataclasses.replace(patch, least=patch.least + share * more)
         out.append(patch)
     return tuple(out)
 
@@ -173,7 +187,7 @@ def skin_height(
 def _posed(patch: SkinPatch, rotations: Array, translations: Array) -> tuple[Array, Array]:
     """Skin and its normals, shape [skin, 3] each."""
     skin, blend = skin_points(patch.rest, patch.weights, rotations, translations)
-    return skin, jnp.einsum("vab,vb->va", blend, patch.normals)
+    return skin, jnp.einsum("vab,vb->va", blend, patch.normals, precision=jax.lax.Precision.HIGHEST)
 
 
 def _clearance(
@@ -185,7 +199,9 @@ def _clearance(
         return _off_skin(points, feet, patch.least, patch.most)
     lying, rows = patch.skirt.lying, patch.skirt.rows
     turn = blend_rotations(patch.skirt.weights, rotations)
-    outward = safe_normalize(jnp.einsum("hab,hb->ha", turn, patch.skirt.outward))
+    outward = safe_normalize(
+        jnp.einsum("hab,hb->ha", turn, patch.skirt.outward, precision=jax.lax.Precision.HIGHEST)
+    )
     meeting = skirt_meeting(patch.skirt, points[rows], outward, skin, normals)
     # One search for all: three would be three times the program to compile.
     feet = skin_foot(

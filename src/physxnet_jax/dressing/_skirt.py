@@ -96,8 +96,9 @@ def make_skirt_patch(
     normals = carry @ vertex_normals(wearable.rest, garment.faces)
     outward = np.asarray(safe_normalize(normals))[rows]
     # Some files have their faces inside out.
-    middle = points[rows].mean(axis=0) * [1, 0, 1]
-    outward *= np.sign(np.mean(np.sum(outward * (points[rows] - middle), axis=1)))
+    if len(rows):
+        middle = points[rows].mean(axis=0) * [1, 0, 1]
+        outward *= np.sign(np.mean(np.sum(outward * (points[rows] - middle), axis=1)))
     legs = np.flatnonzero(_leg_share(body)[:NUM_BODY_VERTICES] > 0.3)
     chosen = legs[spread_points(skin[legs], _SPACING)]
     k = min(_CHOICES, len(chosen))
@@ -233,8 +234,10 @@ def skin_foot(
     """
     hit = closest_among(TriMesh(skin, faces), points, candidates)
     tri = faces[hit.face]
-    foot = jnp.einsum("pk,pkx->px", hit.weights, skin[tri])
-    return foot, safe_normalize(jnp.einsum("pk,pkx->px", hit.weights, normals[tri]))
+    foot = jnp.einsum("pk,pkx->px", hit.weights, skin[tri], precision=jax.lax.Precision.HIGHEST)
+    return foot, safe_normalize(
+        jnp.einsum("pk,pkx->px", hit.weights, normals[tri], precision=jax.lax.Precision.HIGHEST)
+    )
 
 
 def _least(

@@ -126,7 +126,9 @@ def place_local(
 
     def one(r: Array, t: Array, o: Array) -> Array:
         points, blend = skin_points(*worn, r, t)
-        return points + jnp.einsum("vab,vb->va", polar_rotation(blend), o)
+        return points + jnp.einsum(
+            "vab,vb->va", polar_rotation(blend), o, precision=jax.lax.Precision.HIGHEST
+        )
 
     return jax.vmap(one)(rotations, translations, offsets)
 

@@ -330,8 +330,8 @@ def _signed(p: Array, mesh: Array, normals: Array, index: Array) -> tuple[Array,
     best = jnp.argmin(squared, axis=1)
     w = jnp.take_along_axis(weights, best[None, :, None], axis=2)[..., 0].T
     corner = jnp.take_along_axis(index, best[:, None, None], axis=1)[:, 0]
-    foot = jnp.einsum("pk,pki->pi", w, mesh[corner])
-    normal = jnp.einsum("pk,pki->pi", w, normals[corner])
+    foot = jnp.einsum("pk,pki->pi", w, mesh[corner], precision=jax.lax.Precision.HIGHEST)
+    normal = jnp.einsum("pk,pki->pi", w, normals[corner], precision=jax.lax.Precision.HIGHEST)
     gap = p - foot
     side = jnp.sign(jnp.sum(gap * normal, axis=1))
     return side * jnp.sqrt(jnp.sum(gap * gap, axis=1)), w, best

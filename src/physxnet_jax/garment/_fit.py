@@ -5,9 +5,12 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Bool, Float, Int
+from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.linalg import spsolve
 
 from ..geometry import (
     TriMesh,
+    boundary_loops,
     closest_among,
     mesh_edges,
     nearby_faces,
@@ -207,3 +210,43 @@ def smoothing_matrix(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> sp
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1)
     eye = sp.identity(num_vertices, format="csr")
     return sp.csr_matrix(0.5 * eye + 0.5 * sp.diags(1 / degree) @ graph)
+
+
+def level_hem(
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    height: float,
+    *,
+    reach: float = 0.09,
+) -> Float[np.ndarray, "vertices 3"]:
+    """A garment whose lowest border is nowhere higher than this.
+
+    What is above comes down with it, less and less over ``reach``: a harmonic function
+    along the mesh.
+
+    Args:
+        vertices: Garment vertices [m].
+        faces: Garment triangles.
+        height: Of the border [m].
+        reach: How far along the mesh anything is moved [m].
+    """
+    loop = min(boundary_loops(faces), key=lambda rows: vertices[rows, 1].mean())
+    drop = np.minimum(height - vertices[loop, 1], 0.0)
+    if not (drop < 0).any():
+        return vertices
+    a, b = mesh_edges(faces).vertices.T
+    length = np.linalg.norm(vertices[a] - vertices[b], axis=1)
+    count = len(vertices)
+    pairs = (np.concatenate([a, b]), np.concatenate([b, a]))
+    graph = sp.coo_matrix((np.tile(length, 2), pairs), (count, count)).tocsr()
+    far = dijkstra(graph, indices=loop[drop < 0], min_only=True) > reach
+    held = np.union1d(np.flatnonzero(far), loop)
+    free = np.setdiff1d(np.arange(count), held)
+    value = np.zeros(count)
+    value[loop] = drop
+    ties = sp.coo_matrix((np.tile(1.0 / length, 2), pairs), (count, count)).tocsr()
+    laplacian = (sp.diags(np.asarray(ties.sum(axis=1)).ravel()) - ties).tocsr()
+    value[free] = spsolve(
+        laplacian[free][:, free].tocsc(), -(laplacian[free][:, held] @ value[held])
+    )
+    return vertices + value[:, None] * np.array([0.0, 1.0, 0.0])

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import importlib.resources
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -13,7 +14,14 @@ from ..body import Body, load_body
 from ..errors import MeshError
 from ..geometry import TriMesh, boundary_loops, cast_rays, make_mesh, vertex_normals
 from ._cut import cut, pad_rows, refine, split_quads
-from ._fit import bridge_hollows, relax_crossings, set_clearance
+from ._fit import (
+    bridge_hollows,
+    clearance,
+    level_hem,
+    lift_out,
+    relax_crossings,
+    set_clearance,
+)
 from ._garment import COTTON, TEMPLATES, Fabric, Garment, Template, carried_weights
 
 # Heights on the default shape [m]; y = 0 lies in the pelvis.
@@ -28,6 +36,8 @@ _SHORT_SLEEVE = 0.5
 _SKIRT_ROW = 0.021
 _MAX_EDGE = 0.031
 _FARTHEST = 0.019
+# Clearance of a hem that was levelled [m].
+_HEM_GAP = 0.0065
 ASSET = "templates_cc0.npz"
 
 
@@ -80,12 +90,27 @@ def build_template(name: Template, body: Body | None = None) -> Garment:
     vertices = set_clearance(mesh, start, piece.faces, target, free=free)
     vertices = bridge_hollows(mesh, vertices, piece.faces, farthest=_FARTHEST)
     vertices = relax_crossings(mesh, vertices, piece.faces)
+    if name == "top":
+        # Over the hollow behind it was drawn up.
+        vertices = _levelled(mesh, vertices, piece.faces)
     pinned = np.zeros(len(vertices), dtype=bool)
     if name == "bottom":
         loops = boundary_loops(piece.faces)
         waist = max(loops, key=lambda loop: vertices[loop, 1].mean())
         pinned[waist] = True
     return _assemble(name, piece, vertices, vertices - start, pinned, fabric, body)
+
+
+def _levelled(
+    skin: TriMesh, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "vertices 3"]:
+    """A top with a level hem, which keeps as far off the skin as the rest of it."""
+    level = level_hem(vertices, faces, _HEM_TOP)
+    came = np.abs(level - vertices).max(axis=1) > 1e-4
+    clear, _ = lift_out(skin, level, faces, _HEM_GAP, iterations=12)
+    out = np.where(came[:, None], clear, vertices)
+    distance, away = clearance(skin, out)
+    return out - np.where(came, np.maximum(distance - _FARTHEST, 0.0), 0.0)[:, None] * away
 
 
 @functools.cache
@@ -101,6 +126,12 @@ def template(name: Template) -> Garment:
     resource = importlib.resources.files(__name__.rpartition(".")[0]) / "assets" / ASSET
     with importlib.resources.as_file(resource) as path, np.load(path) as data:
         part = {k: data[f"{name}_{k}"] for k in _STORED}
+    # What is kept mustn't belong to the program that happens to be traced.
+    with jax.ensure_compile_time_eval():
+        return _from_arrays(name, part)
+
+
+def _from_arrays(name: Template, part: dict[str, np.ndarray]) -> Garment:
     fabric = Fabric(*(float(x) for x in part["fabric"]))
     mesh = make_mesh(part["vertices"], part["faces"], part["uv"], name=name)
     refs = jnp.asarray(part["refs"].astype(np.int32))

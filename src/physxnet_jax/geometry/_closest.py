@@ -36,11 +36,11 @@ class ClosestPoints:
 
 
 def closest_barycentric(
-    p: Float[Array, "3 *batch"],
-    a: Float[Array, "3 *batch"],
-    b: Float[Array, "3 *batch"],
-    c: Float[Array, "3 *batch"],
-) -> tuple[Float[Array, "3 *batch"], Float[Array, "*batch"]]:
+    p: Float[Array, " 3 *batch"],
+    a: Float[Array, " 3 *batch"],
+    b: Float[Array, " 3 *batch"],
+    c: Float[Array, " 3 *batch"],
+) -> tuple[Float[Array, " 3 *batch"], Float[Array, "*batch"]]:
     """Barycentric coordinates of the point of triangle abc closest to p.
 
     The component axis comes first, so that the work is element-wise over the rest.
@@ -246,7 +246,9 @@ def _signed(
             normals[hit.face],
         ),
     )
-    foot = jnp.einsum("pk,pkc->pc", hit.weights, mesh.vertices[tri])
+    foot = jnp.einsum(
+        "pk,pkc->pc", hit.weights, mesh.vertices[tri], precision=jax.lax.Precision.HIGHEST
+    )
     gap = points - foot
     side = jnp.sum(gap * safe_normalize(normal), axis=1)
     squared = hit.squared_distance

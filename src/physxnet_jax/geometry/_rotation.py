@@ -1,5 +1,6 @@
 """Rotations: unit quaternions (wxyz), matrices, axis-angle. Smooth at the identity."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -106,6 +107,8 @@ def polar_rotation(
     """
     x = matrices
     for _ in range(steps):
-        gram = jnp.einsum("...ji,...jk->...ik", x, x)
-        x = 1.5 * x - 0.5 * jnp.einsum("...ij,...jk->...ik", x, gram)
+        gram = jnp.einsum("...ji,...jk->...ik", x, x, precision=jax.lax.Precision.HIGHEST)
+        x = 1.5 * x - 0.5 * jnp.einsum(
+            "...ij,...jk->...ik", x, gram, precision=jax.lax.Precision.HIGHEST
+        )
     return x

@@ -168,7 +168,9 @@ def relax(springs: Springs, points: Float[Array, "rows 3"], steps: int) -> Float
     """
     if steps == 0:
         return points
-    rows = points[springs.order]
+    # Far from the origin differences of neighbours would be rounded.
+    origin = jax.lax.stop_gradient(points[:1])
+    rows = (points - origin)[springs.order]
 
     def step(carry: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         last, before = carry
@@ -178,7 +180,7 @@ def relax(springs: Springs, points: Float[Array, "rows 3"], steps: int) -> Float
 
     # A gradient computes the inside of a step anew.
     (rows, _), _ = jax.lax.scan(jax.checkpoint(step), (rows, rows), None, length=steps)
-    return rows[springs.back]
+    return rows[springs.back] + origin
 
 
 def _pull(
@@ -194,7 +196,8 @@ def _pull(
         other, share, rest = known
         away = rows[other] - mine
         squared = jnp.sum(away * away, axis=1)
-        least = (_SHORTEST * rest) ** 2 + 1e-20
+        # Ties that fill up rows have no length; second derivatives there must stay finite too.
+        least = (_SHORTEST * rest) ** 2 + 1e-12
         pull = share * (1.0 - rest * jax.lax.rsqrt(jnp.maximum(squared, least)))
         return out + pull[:, None] * away, None
 

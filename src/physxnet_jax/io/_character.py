@@ -49,7 +49,7 @@ def read_character(
     Args:
         path: The file.
         fps: Frames a second of the result.
-        source_fps: True rate of a file that doesn't say it; else 30.
+        source_fps: True rate of a file that doesn't say it; else 30. A glTF does.
         mesh: Name of the mesh to take.
         frames: Keep only this many frames.
         motion: What moves a rigged person (glTF, VRM) instead of the file's animation; at
@@ -112,7 +112,8 @@ def read_character(
     binds = np.zeros(1) if whole.bind is None else whole.bind
     if not all((np.abs(x) < _FARTHEST).all() for x in (whole.positions, binds)):
         raise FormatError(f"{path}: positions that aren't finite. Export it again.")
-    rate = source_fps or rate or 30.0
+    # A glTF tells its times: it was read at the rate that is wanted.
+    rate = (rate if suffix in GLTF_FORMATS else source_fps or rate) or 30.0
     seconds = (len(whole.positions) - 1) / rate
     count = seconds * fps + 1 if frames is None else min(seconds * fps + 1, frames)
     if count * whole.positions[0].size > _MOST:

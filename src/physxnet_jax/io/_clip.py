@@ -51,9 +51,14 @@ class StillMesh:
 def vertex_velocities(
     positions: Float[np.ndarray, "frames vertices 3"], fps: float
 ) -> Float[np.ndarray, "frames vertices 3"]:
-    """Velocities [m/s] by differences with the frame before; zero in the first."""
+    """Velocities [m/s] towards the next frame; in the last as in the one before it.
+
+    A renderer goes from a frame's points along them, until the next frame.
+    """
     out = np.zeros_like(positions)
-    out[1:] = (positions[1:] - positions[:-1]) * fps
+    if len(positions) > 1:
+        out[:-1] = (positions[1:] - positions[:-1]) * fps
+        out[-1] = out[-2]
     return out
 
 

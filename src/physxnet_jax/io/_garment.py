@@ -27,6 +27,7 @@ from ..geometry import (
     TriMesh,
     boundary_loops,
     closest_among,
+    connected_components,
     make_mesh,
     manifold_report,
     mesh_edges,
@@ -40,6 +41,8 @@ NEAREST = 0.003
 # What hangs farther off the skin with its highest tenth, or has longer edges, looks wrong [m].
 HANGS, LONG = 0.02, 0.04
 _TOPMOST = 0.1
+# Legs are apart below this height [m]; a part this large and this far aside is one [1], [m].
+_CROTCH, _LEG_SHARE, _ASIDE = -0.2, 0.15, 0.02
 
 
 @dataclasses.dataclass(frozen=True)
@@ -193,7 +196,7 @@ def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
     points = jnp.asarray(v.astype(np.float32))
     hit = jax.jit(closest_among)(skin, points, jnp.asarray(near))
     refs = skin.faces[hit.face]
-    foot = jnp.einsum("vk,vkc->vc", hit.weights, rest[refs])
+    foot = jnp.einsum("vk,vkc->vc", hit.weights, rest[refs], precision=jax.lax.Precision.HIGHEST)
     weights = np.asarray(carried_weights(body.weights, refs, hit.weights))
     weights = _smooth_far(weights, faces, np.sqrt(np.asarray(hit.squared_distance)))
     pinned = np.zeros(len(v), dtype=bool)
@@ -262,12 +265,29 @@ def guess_template(
     """From what it covers: above the waist, below the crotch, one tube or two."""
     upper = float(np.mean(v[:, 1] > 0.15))
     lower = float(np.mean(v[:, 1] < -0.08))
+    if lower > 0.15 and _has_legs(v, faces):
+        return "bottom"
     if upper > 0.15 and lower > 0.15:
         return "dress"
     if upper >= lower:
         return "top"
     low = [x for x in boundary_loops(faces) if v[x, 1].mean() < -0.08 and len(x) > 4]
     return "bottom" if len(low) >= 2 else "dress"
+
+
+def _has_legs(v: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> bool:
+    """Whether what is below the crotch are two parts, one on either side."""
+    low = faces[(v[faces, 1] < _CROTCH).all(axis=1)]
+    if not len(low):
+        return False
+    rows, at = np.unique(low, return_inverse=True)
+    part = connected_components(at.reshape(-1, 3).astype(np.int32), len(rows))
+    sides = [
+        float(v[rows[part == k], 0].mean())
+        for k in np.unique(part)
+        if np.mean(part == k) > _LEG_SHARE
+    ]
+    return bool(sides) and min(sides) < -_ASIDE and max(sides) > _ASIDE
 
 
 def _smooth_far(weights: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> np.ndarray:

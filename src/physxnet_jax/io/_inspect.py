@@ -52,6 +52,9 @@ _UPRIGHT = {
     "Z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
     "X": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
 }
+# Share inside the body from which a garment may lie elsewhere, and how much nearer to the skin
+# it has to be where it belongs.
+_ELSEWHERE, _NEARER = 0.1, 0.85
 # Lifting ends a little short of what it aims at.
 _LIFT = 1.3
 
@@ -166,6 +169,18 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         )
     if inside > _INSIDE:
         problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
+    if inside > _ELSEWHERE:
+        # Worn the wrong way round or at another height: lifting it out would ruin it.
+        placed, told, _ = _like(raw.vertices, template(garment.template), skin)
+        there, _ = clearance(skin, np.asarray(placed, np.float32))
+        nearer = float(np.mean(np.abs(there))) < _NEARER * float(np.mean(np.abs(distance)))
+        share = float(np.mean(there < NEAREST))
+        if nearer and share < 0.7 * inside:
+            problems.append(
+                f"it lies or faces elsewhere than a {garment.template}: {told.rstrip('.')}, it has"
+                f" {100 * share:.1f} % there."
+            )
+            options.append(f"--like {garment.template}")
     if hangs > HANGS:
         problems.append(
             f"its top stays {1e3 * hangs:.0f} mm off the skin, where nothing holds it up."
@@ -347,7 +362,7 @@ def _hit_rate(body: Body, garment: Garment) -> float:
     rest = body.rest_vertices(body.default_shape())
     atlas = make_atlas(32)
     valid = garment_map_rows(atlas, body, rest, template(garment.template)).valid
-    return bind(atlas, body, rest, garment, valid).hit_rate
+    return float(bind(atlas, body, rest, garment, valid).hit_rate)
 
 
 def _command(path: pathlib.Path, options: list[str]) -> str:

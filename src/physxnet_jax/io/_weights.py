@@ -174,7 +174,9 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
     """
     folder = _folder(weights)
     try:
-        predictor = _load(weights, folder)
+        # Numbers of a file, wherever they are asked for: inside a traced function too.
+        with jax.ensure_compile_time_eval():
+            predictor = _load(weights, folder)
     except WeightsError:
         raise
     # A damaged card may hold anything anywhere; safetensors has errors of its own.

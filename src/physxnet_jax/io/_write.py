@@ -1,6 +1,9 @@
 """One door for every output: the extension decides."""
 
+import dataclasses
+import itertools
 import pathlib
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,6 +19,8 @@ from ._pc2 import write_pc2
 from ._usd import check_usd, write_usd
 
 EXTENSIONS = (".usdc", ".usd", ".usda", ".pc2", ".mdd", ".glb", ".html", ".obj", ".npz")
+# What no file's name may have in it on some system.
+_UNFIT = re.compile(r'[\\/:*?"<>|\x00-\x1f]')
 
 
 def check_output(path: str | pathlib.Path, frames: int | None = None) -> pathlib.Path:
@@ -50,7 +55,8 @@ def write_clip(
     ``.html``: a page that plays it.
     ``.npz``: ``NAME_positions``, ``NAME_faces`` and ``fps``. ``.pc2``, ``.mdd``: for each
     mesh a cache and an OBJ of its first frame with the same vertex order, ``STEM_NAME.pc2``
-    and ``STEM_NAME.obj``. ``.obj``: a file for each mesh and frame, ``STEM_NAME_0000.obj``.
+    and ``STEM_NAME.obj``. ``.obj``: a file for each mesh and frame, ``STEM_NAME_0000.obj``;
+    what follows their numbers, of a longer clip before, is removed.
 
     Raises:
         FormatError: Another extension, or too many frames for glTF.
@@ -58,6 +64,8 @@ def write_clip(
     """
     path = check_output(path)
     suffix = path.suffix.lower()
+    # Names become parts of file names.
+    meshes = [dataclasses.replace(m, name=_UNFIT.sub("_", m.name)) for m in meshes]
     if suffix.startswith(".usd"):
         write_usd(path, meshes, fps)
         return [path]
@@ -81,6 +89,12 @@ def write_clip(
                 frame = path.with_name(f"{stem}_{k:04d}.obj")
                 write_obj(frame, x, m.faces, m.uv, m.uv_faces)
                 written.append(frame)
+            # A longer clip of before would be taken for the rest of this one.
+            for k in itertools.count(len(m.positions)):
+                left = path.with_name(f"{stem}_{k:04d}.obj")
+                if not left.is_file():
+                    break
+                left.unlink()
             continue
         cache = path.with_name(f"{stem}{suffix}")
         if suffix == ".mdd":

@@ -56,8 +56,11 @@ def average_networks(predictors: Sequence[Predictor]) -> Predictor:
             for t in first.config.templates
             if p.config == first.config
         )
-        if p.config != first.config or p.mirrored != first.mirrored or not alike:
-            raise ValueError("networks of different configurations, input scales or texels.")
+        ways = (p.mirrored, p.relaxation) == (first.mirrored, first.relaxation)
+        if p.config != first.config or not ways or not alike:
+            raise ValueError(
+                "networks of different configurations, input scales, texels or relaxation."
+            )
         network = nnx.merge(p.graph, p.state, copy=True)
         if not isinstance(network, Generator):
             raise ValueError(f"a Generator is wanted, got {type(network).__name__}.")

@@ -116,14 +116,15 @@ def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
     stack: list[int] = []
     taken: collections.Counter[str] = collections.Counter()
     pending = end_site = False
-    if lines[0].strip().upper() != "HIERARCHY":
+    first = next((n for n, line in enumerate(lines) if line.strip()), 0)
+    if lines[first].strip().upper() != "HIERARCHY":
         raise MotionError.at(
             path,
-            1,
-            f"'{lines[0].strip()[:40]}' where HIERARCHY was expected",
+            first + 1,
+            f"'{lines[first].strip()[:40]}' where HIERARCHY was expected",
             "Is this a BVH file?",
         )
-    for n, line in enumerate(lines[1:], start=2):
+    for n, line in enumerate(lines[first + 1 :], start=first + 2):
         words = line.split()
         if not words:
             continue
@@ -233,7 +234,7 @@ def _read_motion(
             f"'{body[0][1].strip()[:60]}' is not a number of frames",
             "Write the number of motion lines",
         )
-    if not body[1][1].strip().startswith("Frame Time:"):
+    if not " ".join(body[1][1].split()).startswith("Frame Time:"):
         raise MotionError.at(path, body[1][0], "no 'Frame Time:'", "Export again")
     step = numbers(path, body[1][0], body[1][1].split(":")[1].split())
     if len(step) != 1 or step[0] <= 0:

@@ -74,6 +74,11 @@ def load_motion(
         read = _read_npz(path)
         source, clip = (read, None) if isinstance(read, SourceClip) else (None, read)
     elif str(motion) in CLIPS:
+        if source_fps is not None:
+            raise MotionError(
+                f"source_fps is the true rate of a file; '{motion}' is computed at any rate."
+                " Leave it out."
+            )
         clip = procedural_clip(str(motion), fps=float(fps or 30), body=body, shape=shape)
     elif suffix == ".fbx":
         raise MotionError.at(path, None, "FBX isn't read", "Export BVH or glTF, from Blender say")

@@ -11,8 +11,12 @@ from ..body import NUM_BODY_VERTICES, Body, align_global, load_body
 from ..errors import MotionError
 from ._motion import Motion, animate, make_motion
 from ._reference import limb_directions, reference_pose, upright
-from ._skeletons import NEEDED, find_joint_map
+from ._skeletons import NEEDED, find_joint_map, nearest_joint_map
 from ._source import SourceClip
+
+# How long the way from a T-pose takes at most [s], and how much faster it is than a clip's
+# fastest twentieth.
+_APPROACH, _SUDDEN = 0.25, 1.5
 
 
 def retarget(
@@ -74,25 +78,53 @@ def retarget(
         .as_quat(scalar_first=True)
         .reshape(len(root), -1, 4)
     )
+    if start:
+        quaternions, root = _without_approach(quaternions, root, source.fps)
     motion = make_motion(quaternions, root, source.fps, name=source.name)
     return stand_on_floor(body, motion, rest)
+
+
+def _without_approach(
+    q: Float[np.ndarray, "frames joints 4"], root: Float[np.ndarray, "frames 3"], fps: float
+) -> tuple[Float[np.ndarray, "frames joints 4"], Float[np.ndarray, "frames 3"]]:
+    """The clip without its way from the T-pose, which no person goes: it begins as it goes on.
+
+    Conversions blend from their T-pose within a few frames; their number stays.
+    """
+    turned = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=2)), 0.0, 1.0)).max(axis=1)
+    few = min(int(_APPROACH * fps), len(turned) // 3)
+    fast = np.flatnonzero(turned[:few] > _SUDDEN * np.quantile(turned[few:], 0.95)) if few else []
+    if len(fast):
+        settled = int(fast[-1]) + 1
+        q, root = q.copy(), root.copy()
+        q[:settled], root[:settled] = q[settled], root[settled]
+    return q, root
 
 
 def joint_index(
     source: SourceClip, body: Body, joint_map: Mapping[str, str] | None = None
 ) -> dict[str, int]:
-    """Joints of the body to places of theirs in a skeleton, by a map or by the names.
+    """Joints of the body to places of theirs in a skeleton, by a map and by the names.
+
+    What the map leaves out is taken from the nearest family, if its names are there.
 
     Raises:
         MotionError: Unknown joints, a map without the limbs.
     """
-    joints = dict(joint_map) if joint_map is not None else find_joint_map(source)[1]
-    if NEEDED - joints.keys() or joints.keys() - set(body.joint_names):
+    if joint_map is None:
+        joints = find_joint_map(source)[1]
+    else:
+        told = set(joint_map.values())
+        known = nearest_joint_map(source)[1]
+        joints = {b: s for b, s in known.items() if s not in told} | dict(joint_map)
+    lacking, strange = NEEDED - joints.keys(), joints.keys() - set(body.joint_names)
+    if lacking or strange:
+        wrong = [f"lacks {', '.join(sorted(lacking))}"] if lacking else []
+        wrong += [f"has {', '.join(sorted(strange))}, which the body hasn't"] if strange else []
         raise MotionError.at(
             source.path,
             None,
-            f"the joint map lacks {sorted(NEEDED - joints.keys())} and has unknown"
-            f" {sorted(joints.keys() - set(body.joint_names))}",
+            f"the joint map {' and '.join(wrong)}",
             f"Map at least the limbs; the body has {', '.join(body.joint_names)}",
         )
     index = {}

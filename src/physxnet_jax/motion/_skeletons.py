@@ -155,6 +155,23 @@ def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
     Raises:
         MotionError: If none fits; the text lists what is missing from the nearest.
     """
+    family, joints = nearest_joint_map(source)
+    if NEEDED - joints.keys():
+        needed = [s for b, s in JOINT_MAPS[family].items() if b in NEEDED - joints.keys()]
+        lacks = ", ".join(needed[:6])
+        raise MotionError.at(
+            source.path,
+            None,
+            f"unknown joints: of {len(JOINT_MAPS)} known skeletons the nearest, {family}, would"
+            f" have {lacks} too",
+            "Pass a joint map (--joint-map FILE, joint_map={'Hips': 'your name', …}); the"
+            f" file has {', '.join(source.names[:40])}",
+        )
+    return family, joints
+
+
+def nearest_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
+    """The family of which the skeleton has most, and what it has of it."""
     have = {_plain(name): name for name in reversed(source.names)}
     found: dict[str, dict[str, str]] = {}
     for family, joints in JOINT_MAPS.items():
@@ -170,19 +187,7 @@ def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
         for family, joints in JOINT_MAPS.items()
     }
     family = min(missing, key=lambda f: (len(NEEDED - found.get(f, {}).keys()), len(missing[f])))
-    joints = found.get(family, {})
-    if NEEDED - joints.keys():
-        needed = [s for b, s in JOINT_MAPS[family].items() if b in NEEDED - joints.keys()]
-        lacks = ", ".join(needed[:6])
-        raise MotionError.at(
-            source.path,
-            None,
-            f"unknown joints: of {len(JOINT_MAPS)} known skeletons the nearest, {family}, would"
-            f" have {lacks} too",
-            "Pass a joint map (--joint-map FILE, joint_map={'Hips': 'your name', …}); the"
-            f" file has {', '.join(source.names[:40])}",
-        )
-    return family, joints
+    return family, found.get(family, {})
 
 
 def _plain(name: str) -> str:

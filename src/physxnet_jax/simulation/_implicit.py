@@ -126,7 +126,7 @@ class Implicit(Solver):
             return free * pattern.apply(blocks, free * p) + (1 - free) * p
 
         def precondition(r: Array) -> Array:
-            return jnp.einsum("vbij,vjb->vib", inverse, r)
+            return jnp.einsum("vbij,vjb->vib", inverse, r, precision=jax.lax.Precision.HIGHEST)
 
         def solve(apply: Any, b: Array) -> Array:
             dot = lambda a, c: jnp.sum(a * c, axis=(0, 1), keepdims=True)  # noqa: E731
@@ -201,7 +201,7 @@ class Pattern:
         """The matrix times a vector of shape [vertices, 3, batch]."""
         rows, k = self.neighbour.shape
         around = p[self.neighbour].transpose(0, 3, 1, 2).reshape(rows, p.shape[2], 3 * k)
-        return jnp.einsum("vbim,vbm->vib", blocks, around)
+        return jnp.einsum("vbim,vbm->vib", blocks, around, precision=jax.lax.Precision.HIGHEST)
 
     def diagonal(self, blocks: Array, free: Array) -> Float[Array, "vertices batch 3 3"]:
         """The diagonal blocks; the identity for held vertices, whose own may be singular."""

@@ -2,6 +2,7 @@
 
 import contextlib
 import hashlib
+import importlib.metadata
 import pathlib
 import zipfile
 import zlib
@@ -79,7 +80,8 @@ class Resume:
 
     def finish(self) -> None:
         """Removes what was kept, and the folder if nothing else is in it."""
-        for file in (self.folder / "key.txt", *self.folder.glob("block_*.npz")):
+        # The key last: without it what is left would be refused.
+        for file in (*self.folder.glob("block_*.npz"), self.folder / "key.txt"):
             file.unlink()
         with contextlib.suppress(OSError):
             self.folder.rmdir()
@@ -89,11 +91,21 @@ class Resume:
 
 
 def fingerprint(*trees: Any) -> str:
-    """A hash of pytrees: their arrays and all that is static in them."""
+    """A hash of pytrees: their arrays and all that is static in them, and what computes them.
+
+    The same in every process: a rollout goes on in another one.
+    """
     digest = hashlib.sha256()
+    digest.update(f"{importlib.metadata.version('physxnet-jax')} {jax.__version__}".encode())
     for tree in trees:
         leaves, structure = jax.tree.flatten(tree)
         digest.update(str(structure).encode())
         for x in leaves:
-            digest.update(np.ascontiguousarray(x).tobytes())
+            numbers = np.asarray(x)
+            if numbers.dtype == object:
+                # Its bytes would be an address.
+                digest.update(repr(x).encode())
+            else:
+                digest.update(f"{numbers.dtype} {numbers.shape}".encode())
+                digest.update(np.ascontiguousarray(numbers).tobytes())
     return digest.hexdigest()

@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ..errors import SimulationError
+from ._effect import Prepared
 from ._solver import Solver, accelerate_all, project_all
 from ._state import System
 
@@ -32,6 +34,12 @@ class XPBD(Solver):
         h: float,
         count: int,
     ) -> tuple[Array, Array, Any]:
+        for e in system.effects:
+            if e.elastic and type(e).project is Prepared.project:
+                raise SimulationError(
+                    f"{type(e).__name__} stores energy and says nothing of how it is projected,"
+                    " which XPBD asks for. Give it a `project`, or choose Verlet or Implicit."
+                )
         share = 1.0 / count
 
         def substep(i: Array, moving: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -153,8 +153,12 @@ def _to_local(
 @jax.jit
 def _rotate_back(skin: Array, world: Array, offset: Array) -> Array:
     def one(r: Array, o: Array) -> Array:
-        blend = jnp.matmul(skin, r.reshape(-1, 9)).reshape(-1, 3, 3)
-        return jnp.einsum("vba,vb->va", polar_rotation(blend), o)
+        blend = jnp.matmul(skin, r.reshape(-1, 9), precision=jax.lax.Precision.HIGHEST).reshape(
+            -1, 3, 3
+        )
+        return jnp.einsum(
+            "vba,vb->va", polar_rotation(blend), o, precision=jax.lax.Precision.HIGHEST
+        )
 
     return jax.vmap(one)(world, offset)
 

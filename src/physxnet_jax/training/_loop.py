@@ -104,8 +104,9 @@ def train(
     state = run.first if restored is None else restored
     done = int(state.step)
     best_kept.forget_after(done)
-    watch = Validation(read_metrics(folder), done, config.patience)
-    players = Players()
+    noted = read_metrics(folder)
+    watch = Validation(noted, done, config.patience)
+    players = Players(noted, done)
     key = jax.random.key(config.seed)
     board = Board(folder)
     began = time.perf_counter()
@@ -181,8 +182,11 @@ def _validate(
     # Neighbouring frames tell the same.
     order = np.arange(0, len(frames), 3)
     for start in range(0, len(order), config.batch):
-        index = np.resize(order[start : start + config.batch], config.batch)
-        batch = take(frames, index)
+        real = order[start : start + config.batch]
+        batch = take(frames, np.resize(real, config.batch))
+        for t in config.model.templates:
+            # What fills up the last batch counts for nothing.
+            batch[f"weight_{t}"][len(real) :] = 0.0
         losses, maps = run.look(state, batch)
         for t, value in losses.items():
             count = float(batch[f"weight_{t}"].sum())

@@ -64,10 +64,20 @@ class Validation:
 
 
 class Players:
-    """Whether generator and discriminator still learn from each other."""
+    """Whether generator and discriminator still learn from each other.
 
-    def __init__(self) -> None:
-        self._accuracy: float | None = None
+    Args:
+        noted: What an interrupted run has written, line by line.
+        done: Up to which step it is kept.
+    """
+
+    def __init__(self, noted: Sequence[Mapping[str, float]] = (), done: int = 0) -> None:
+        means = [
+            line["discriminator_accuracy_mean"]
+            for line in noted
+            if "discriminator_accuracy_mean" in line and line["step"] <= done
+        ]
+        self._accuracy: float | None = means[-1] if means else None
 
     def update(self, metrics: Mapping[str, float]) -> dict[str, float]:
         """Running mean of the discriminator's accuracy, and its alarm.

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import hashlib
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -116,7 +117,9 @@ def make_atlas(resolution: int | tuple[int, int] = 256, body: Body | None = None
 
 @functools.cache
 def _cached_atlas(height: int, width: int) -> Atlas:
-    return _make_atlas((height, width), load_body())
+    # What is kept mustn't belong to the program that happens to be traced.
+    with jax.ensure_compile_time_eval():
+        return _make_atlas((height, width), load_body())
 
 
 def _make_atlas(size: tuple[int, int], body: Body) -> Atlas:

@@ -38,9 +38,10 @@ class Binding:
     to_body: Transference
     texel: Int[Array, "vertices 4"]
     weight: Float[Array, "vertices 4"]
-    hit_rate: float = dataclasses.field(metadata={"static": True})
-    fallbacks: int = dataclasses.field(metadata={"static": True})
-    off_chart: int = dataclasses.field(metadata={"static": True})
+    # No part of a program's identity: garments of other sizes share it.
+    hit_rate: Float[Array, ""]
+    fallbacks: Int[Array, ""]
+    off_chart: Int[Array, ""]
 
     def sample(
         self, values: Float[Array, "*batch texels channels"]
@@ -146,9 +147,9 @@ def bind(
         ),
         jnp.asarray(texel),
         jnp.asarray(weight),
-        float(np.mean(good)),
-        int(np.sum(~good)),
-        off,
+        jnp.asarray(np.float32(np.mean(good))),
+        jnp.asarray(np.int32(np.sum(~good))),
+        jnp.asarray(np.int32(off)),
     )
 
 

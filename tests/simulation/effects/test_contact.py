@@ -151,6 +151,12 @@ def test_limbs_share_the_room_between_them(body, rest):
             break
     else:
         pytest.fail("the arm wasn't pressed into the trunk either way")
+    # A kilometre away the same skin has the same room, to what float32 tells there.
+    for away, most in ((8.0, 0.0), (992.0, 1e-3)):
+        far = dataclasses.replace(placed, points=placed.points + jnp.float32(away))
+        back = dataclasses.replace(far, points=far.points - jnp.float32(away))
+        there, here = (pinch.room(x)[:, 0] for x in (far, back))
+        assert np.abs(there - here).max() <= max(most, 2e-5)
     out = simulate(
         Scene((template("top"),)),
         Motion(jnp.repeat(motion.rotations, 4, 0), jnp.repeat(motion.root, 4, 0), FPS, "held"),

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -107,9 +108,11 @@ class _Air(Prepared):
             k, way, rate, phase = self.modes
             # Eddies travel with the wind.
             seen = base - clock.time * mean
-            angle = jnp.einsum("mc,vcb->vmb", k, seen)
+            angle = jnp.einsum("mc,vcb->vmb", k, seen, precision=jax.lax.Precision.HIGHEST)
             angle = angle - (rate * clock.time - phase)[None, :, None]
-            wind = wind + jnp.einsum("vmb,mc->vcb", jnp.cos(angle), way)
+            wind = wind + jnp.einsum(
+                "vmb,mc->vcb", jnp.cos(angle), way, precision=jax.lax.Precision.HIGHEST
+            )
         return unit, wind
 
     def accelerate(self, velocity: Array, context: tuple[Array, Array], h: float) -> Array:

@@ -22,6 +22,8 @@ _APART = 0.06
 _ASIDE = 0.01
 # Skin deeper than this below another's lies on the far side of a limb [m].
 _DEEP = 0.06
+# Positions are told from the nearest of places this far apart [m].
+_GRID = 16.0
 # Lateral reach of the test at rest that tells the far side of a limb [m].
 _BROAD = 0.08
 # More room than this is no pinch [m].
@@ -52,6 +54,8 @@ class Pinch:
         """
         p, n = skin.points[self.samples], skin.normals[self.samples]
         stop = jax.lax.stop_gradient
+        # Squares of coordinates far from the origin would drown the distances.
+        p = p - stop(_GRID * jnp.round(jnp.mean(p, axis=0, keepdims=True) / _GRID))
         squared = jnp.sum(p * p, axis=1)
         # The points' own squared length doesn't change which is the nearest.
         gap = squared[None] - 2.0 * jnp.einsum(
