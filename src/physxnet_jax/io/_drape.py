@@ -19,6 +19,7 @@ _LOST = 0.25
 def drape(
     garment: Garment,
     *,
+    start: Float[np.ndarray, "vertices 3"] | None = None,
     body: Body | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Float[np.ndarray, "vertices 3"]:
@@ -28,7 +29,8 @@ def drape(
     which takes the energy out of swings, until it stays where it is or four seconds are over.
 
     Args:
-        garment: The garment.
+        garment: The garment; its mesh says how long its edges are.
+        start: Where it begins to fall [m]; there if omitted.
         body: The body; the built-in one by default.
         progress: Called with halts done and halts at most.
 
@@ -44,7 +46,7 @@ def drape(
         to a halt.
     """
     scene = prepare_scene(Scene((garment,), standard_effects(1), body))
-    x = rest = np.asarray(garment.mesh.vertices, np.float64)
+    x = rest = np.asarray(garment.mesh.vertices if start is None else start, np.float64)
     for k in range(_HALTS):
         if progress is not None:
             progress(k, _HALTS)

@@ -297,9 +297,10 @@ def fit_garment(
     if low.any():
         done.append(f"lifted {int(low.sum()):,} vertices out of the body or off it.")
     if draped:
-        hung = mesh.replace(vertices=jnp.asarray(moved.astype(np.float32)))
         kind = guess_template(moved, np.asarray(mesh.faces)) if like is None else like
-        lain = drape(carried(hung, kind, path.name, body), body=body, progress=progress)
+        # Lifted over what it will slide down from, its edges are longer than it was made.
+        hung = carried(mesh, kind, path.name, body)
+        lain = drape(hung, start=moved, body=body, progress=progress)
         far = np.linalg.norm(lain - moved, axis=1)
         done.append(f"let it down: it moved by {1e3 * float(np.median(far)):.0f} mm.")
         moved, _ = lift_out(skin, lain, np.asarray(mesh.faces), _LIFT * NEAREST, iterations=12)

@@ -69,8 +69,9 @@ def save_predictor(
     plain = nnx.eval_shape(lambda: make_generator(predictor.config))
     if jax.tree.structure(nnx.state(network)) != jax.tree.structure(nnx.state(plain)):
         raise WeightsError(
-            f"{name}: this network has been folded or is none of make_generator's; save the"
-            " predictor that was trained or loaded."
+            f"{name}: this network has been folded (as a dresser's is) or is none of"
+            " make_generator's; teach and save the predictor that was loaded, as in"
+            " examples/05_fine_tune.py."
         )
     if predictor.mirrored or predictor.relaxation:
         raise WeightsError(
