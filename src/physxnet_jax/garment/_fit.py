@@ -246,7 +246,6 @@ def level_hem(
     value[loop] = drop
     ties = sp.coo_matrix((np.tile(1.0 / length, 2), pairs), (count, count)).tocsr()
     laplacian = (sp.diags(np.asarray(ties.sum(axis=1)).ravel()) - ties).tocsr()
-    value[free] = spsolve(
-        laplacian[free][:, free].tocsc(), -(laplacian[free][:, held] @ value[held])
-    )
+    inner = laplacian[free][:, free].tocsc()
+    value[free] = np.asarray(spsolve(inner, -(laplacian[free][:, held] @ value[held])))
     return vertices + value[:, None] * np.array([0.0, 1.0, 0.0])

@@ -5,7 +5,6 @@ import pathlib
 import shlex
 from collections.abc import Callable
 
-import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
 
