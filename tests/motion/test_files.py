@@ -51,6 +51,9 @@ def test_retargeted_limbs_point_where_the_sources_do(data_dir, body, rest, name)
     world, shift = clip_transforms(body, rest, motion)
     heads = np.asarray(body.joint_positions(rest)[0])
     ours = np.einsum("fjab,jb->fja", world, heads) + shift
+    # DAZ conversions come from a T-pose within some frames, which no person goes.
+    begin = 10 if name.startswith("daz") else 0
+    positions, ours = positions[begin:], ours[begin:]
     for a, b in LIMBS.items():
         theirs = (
             positions[:, source.names.index(joints[b])]

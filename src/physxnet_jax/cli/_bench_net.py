@@ -5,7 +5,7 @@ import json
 import math
 import pathlib
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -24,7 +24,7 @@ from ..dressing import (
 from ..errors import FormatError
 from ..evaluation import ENGINES
 from ..files import whole_file
-from ..garment import TEMPLATES
+from ..garment import TEMPLATES, Template
 from ..io import load_predictor
 from ..models import at_precision
 from ..motion import load_motion
@@ -43,6 +43,7 @@ def bench_net(command: Bench, console: Console) -> int:
         tests = [read_sequence(f) for f in list_sequences(command.data, "test")]
         if not tests:
             raise FormatError(f"{command.data}: no 'test' actions; build a dataset first.")
+    known_errors = _evaluated(command.errors)
     rows: list[Cost] = []
     if command.out is not None and command.out.is_file():
         rows = [_from_json(r) for r in json.loads(command.out.read_text())["rows"]]
@@ -62,11 +63,11 @@ def bench_net(command: Bench, console: Console) -> int:
             ]
             if command.times:
                 # Errors don't change; a method without any isn't measured anew.
-                again = _measure(kind, size, precision, command, []) if known else ()
+                again = _measure(kind, size, precision, command, [], {}) if known else ()
                 rows = [r for r in rows if r not in known]
                 rows += [_with_errors(r, known) for r in again]
             elif not known:
-                rows += list(_measure(kind, size, precision, command, tests))
+                rows += list(_measure(kind, size, precision, command, tests, known_errors))
             rows.sort(key=_place)
             if command.out is not None:
                 data = [_to_json(r) for r in rows]
@@ -106,27 +107,59 @@ def _place(row: Cost) -> tuple[object, ...]:
 
 
 def _measure(
-    kind: str, size: str, precision: Precision, command: Bench, tests: list[Action]
+    kind: str,
+    size: str,
+    precision: Precision,
+    command: Bench,
+    tests: list[Action],
+    evaluated: Mapping[str, dict[Template, float]],
 ) -> Iterator[Cost]:
     walk = load_motion("walk", fps=30.0)
     if kind != "network":
-        method = method_by_name("lbs" if kind == "lbs" else size)
-        errors = {} if kind == "engine" else mean_errors(method, tests, TEMPLATES)
+        name = "lbs" if kind == "lbs" else size
+        method = method_by_name(name)
+        errors = evaluated.get(name)
+        if errors is None:
+            errors = {} if kind == "engine" else mean_errors(method, tests, TEMPLATES)
         yield from other_costs(kind, size, method, walk, errors)
         return
     source = weights_folder(size)
     predictor = at_precision(load_predictor(source), precision)
+    # Evaluated were the weights as they are.
+    ways = ("network", size), ("network+push", f"{size}+push")
+    found = {w: evaluated[n] for w, n in ways if precision == "float32" and n in evaluated}
+    if len(found) < len(ways):
+        found = network_errors(predictor, tests)
     for row in network_costs(
         source,
         predictor,
         walk,
-        network_errors(predictor, tests),
+        found,
         batches=command.batches,
         garments=command.garments,
         backward=command.backward,
         precision=precision,
     ):
         yield dataclasses.replace(row, size=pathlib.Path(size).name)
+
+
+def _evaluated(path: pathlib.Path | None) -> dict[str, dict[Template, float]]:
+    """Mean errors [mm] over actions against our simulator, by method and template."""
+    if path is None:
+        return {}
+    each: dict[str, dict[Template, list[float]]] = {}
+    try:
+        for r in json.loads(path.read_text()):
+            if r["engine"] == "physxnet":
+                found = each.setdefault(r["method"], {}).setdefault(r["template"], [])
+                found.append(float(r["rmse_vertices_mm"]))
+    except (ValueError, TypeError, KeyError):
+        raise FormatError(f"{path}: no rows of `physxnet evaluate`; name its --out file.") from None
+    return {
+        m: {t: statistics.fmean(x) for t, x in of.items()}
+        for m, of in each.items()
+        if of.keys() == set(TEMPLATES)
+    }
 
 
 def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:

@@ -49,6 +49,8 @@ class Bench:
     """net: names or folders of weights, or runs."""
     data: pathlib.Path | None = None
     """net: a dataset whose test actions give the errors; times alone without one."""
+    errors: pathlib.Path | None = None
+    """net: rows of `physxnet evaluate` against that dataset; what is there isn't measured again."""
     simulator: tuple[Literal["draft", "standard", "fine", "noise", "blender", "newton"], ...] = ()
     """net: accuracies of the simulator to run as well; noise is standard with jitter.
     blender, newton: their times alone, for they model another cloth."""

@@ -197,6 +197,8 @@ def dress(
     with watch("body"):
         if person is not None:
             positions = {g.name: follow_leftover(g, person, positions[g.name]) for g in garments}
+            # Both against the skin that is seen.
+            inside_raw = {g.name: inside_character(person, positions[g.name]) for g in garments}
             if resolve:
                 positions = {
                     w.name: clear_of_character(p, w, person, positions[w.name], world, shift)

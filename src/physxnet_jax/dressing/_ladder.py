@@ -178,7 +178,8 @@ class _Clock:
         kept = _read(self._path)
         if kept.get("machine") == self._machine:
             for name, times in kept["times"].items():
-                self.times[name] = times | self.times.get(name, {})
+                mine = self.times.setdefault(name, {})
+                mine.update({k: v for k, v in times.items() if k not in mine})
         with whole_file(self._path) as part:
             kept = {"machine": self._machine, "times": self.times}
             part.write_text(json.dumps(kept, indent=1) + "\n")

@@ -1,6 +1,5 @@
 """One door for every output: the extension decides."""
 
-import dataclasses
 import itertools
 import pathlib
 import re
@@ -64,8 +63,6 @@ def write_clip(
     """
     path = check_output(path)
     suffix = path.suffix.lower()
-    # Names become parts of file names.
-    meshes = [dataclasses.replace(m, name=_UNFIT.sub("_", m.name)) for m in meshes]
     if suffix.startswith(".usd"):
         write_usd(path, meshes, fps)
         return [path]
@@ -83,7 +80,7 @@ def write_clip(
         return [path]
     written = []
     for m in meshes:
-        stem = f"{path.stem}_{m.name}"
+        stem = f"{path.stem}_{_UNFIT.sub('_', m.name)}"
         if suffix == ".obj":
             for k, x in enumerate(m.positions):
                 frame = path.with_name(f"{stem}_{k:04d}.obj")

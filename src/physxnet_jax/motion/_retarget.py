@@ -93,9 +93,9 @@ def _without_approach(
     """
     turned = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=2)), 0.0, 1.0)).max(axis=1)
     few = min(int(_APPROACH * fps), len(turned) // 3)
-    fast = np.flatnonzero(turned[:few] > _SUDDEN * np.quantile(turned[few:], 0.95)) if few else []
-    if len(fast):
-        settled = int(fast[-1]) + 1
+    usual = np.quantile(turned[few:], 0.95) if few else np.inf
+    settled = int(np.argmax(np.append(turned[:few] <= _SUDDEN * usual, True)))
+    if settled:
         q, root = q.copy(), root.copy()
         q[:settled], root[:settled] = q[settled], root[settled]
     return q, root
