@@ -25,13 +25,14 @@ from ..garment import (
     template,
     weld,
 )
-from ..geometry import TriMesh, make_mesh
+from ..geometry import TriMesh, make_mesh, vertex_normals
 from ..uv import bind, garment_map_rows, make_atlas
 from ._drape import drape
 from ._garment import (
     HANGS,
     LONG,
     NEAREST,
+    UNITS,
     carried,
     guess_template,
     hangs_off,
@@ -54,6 +55,10 @@ _UPRIGHT = {
 # Share inside the body from which a garment may lie elsewhere, and how much nearer to the skin
 # it has to be where it belongs.
 _ELSEWHERE, _NEARER = 0.1, 0.85
+# Garments this much longer or shorter than a template (a logarithm) keep their size.
+_ITS_SIZE = 0.2
+# How far such a one is tried up and down, to the front and back [m].
+_RISES, _ADVANCES = np.linspace(-0.08, 0.08, 9), np.linspace(-0.03, 0.03, 7)
 # Lifting ends a little short of what it aims at.
 _LIFT = 1.3
 
@@ -327,10 +332,13 @@ def _like(vertices: np.ndarray, wanted: Garment, skin: TriMesh) -> tuple[np.ndar
         for quarter in range(4):
             size = np.ptp(upright, axis=0)
             if size[1] > 0:
-                scale = float((high - low)[1] / size[1])
+                scale = _in_its_unit(float((high - low)[1] / size[1]))
                 unlike = float(np.mean(np.abs(scale * size - (high - low))))
-                middle = upright.min(axis=0) + 0.5 * size
-                placed = (upright - middle) * scale + 0.5 * (low + high)
+                # Hung from where it is held: neck or waist.
+                held = upright.min(axis=0) + size * [0.5, 1.0, 0.5]
+                placed = (upright - held) * scale + np.where(
+                    [False, True, False], high, 0.5 * (low + high)
+                )
                 tried.append((unlike, up, quarter, scale, placed))
             upright = upright[:, [2, 1, 0]] * [1.0, 1.0, -1.0]
     alike = min((t[0] for t in tried), default=0.0) + _UNLIKE
@@ -346,7 +354,32 @@ def _like(vertices: np.ndarray, wanted: Garment, skin: TriMesh) -> tuple[np.ndar
             about = f", turned by {90 * quarter} degrees about it" if quarter else ""
             told = f"scaled by {scale:.4g}, {up} up{about}, moved to where a {wanted.template} is."
             best = (placed, told, off)
-    return best
+    placed, told, off = best
+    return _settled(placed, skin), told, off
+
+
+def _settled(placed: np.ndarray, skin: TriMesh) -> np.ndarray:
+    """Moved up or down, to the front or back by a few centimetres, to where it fits best."""
+    points, normals = (
+        np.asarray(skin.vertices),
+        np.asarray(vertex_normals(skin.vertices, skin.faces)),
+    )
+    tree = KDTree(points)
+
+    def misfit(shift: np.ndarray) -> float:
+        moved = placed + shift
+        distance, nearest = tree.query(moved)
+        depth = np.einsum("ij,ij->i", points[nearest] - moved, normals[nearest])
+        return float(distance.mean() + 0.2 * np.mean(depth > 0) + 0.1 * np.abs(shift).sum())
+
+    ways = [np.array([0.0, y, z]) for y in _RISES for z in _ADVANCES]
+    return placed + min(ways, key=misfit)
+
+
+def _in_its_unit(scale: float) -> float:
+    """A unit's own scale, if a garment is of about the wanted size in it."""
+    near = min(UNITS.values(), key=lambda s: abs(np.log(scale / s)))
+    return near if abs(np.log(scale / near)) < _ITS_SIZE else scale
 
 
 def _apart(vertices: np.ndarray) -> dict[Template, float]:
