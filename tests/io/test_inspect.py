@@ -15,7 +15,7 @@ from physxnet_jax.geometry import make_mesh
 from physxnet_jax.io import fit_garment, inspect_garment, load_garment, read_obj, write_obj
 from physxnet_jax.io._drape import drape
 from physxnet_jax.io._garment import carried, guess_template, place_on_body
-from physxnet_jax.io._inspect import _like
+from physxnet_jax.io._like import place_like
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +207,7 @@ def test_however_it_lies_and_faces_it_is_put_where_the_template_is(name):
         "X up": (y, -x, z),
     }
     for how, axes in lying.items():
-        placed, told, off = _like(100.0 * np.stack(axes, axis=1) + 40.0, garment, skin)
+        placed, told, off = place_like(100.0 * np.stack(axes, axis=1) + 40.0, garment, skin)
         assert np.abs(placed - there).max() < 1e-6, f"{how}: {told}"
         assert how[:4] in told and ("turned" in told) == ("turned" in how) and off < 0.2
 

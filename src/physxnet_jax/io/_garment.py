@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 import shlex
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -228,8 +229,7 @@ def place_on_body(
     """
     mesh = body.rest_mesh()
     skin = np.asarray(mesh.vertices)
-    normals = np.asarray(vertex_normals(mesh.vertices, mesh.faces))
-    tree = KDTree(skin)
+    misfit = skin_misfit(mesh)
     floor = np.array([0.0, float(skin[:, 1].min()), 0.0])
     best = (np.inf, vertices, "m", "Y")
     for up in ("Y", "Z"):
@@ -240,10 +240,8 @@ def place_on_body(
                 size = np.ptp(v, axis=0).max()
                 if not 0.1 < size < 2.5:
                     continue
-                distance, nearest = tree.query(v)
-                depth = np.einsum("ij,ij->i", skin[nearest] - v, normals[nearest])
                 # A garment too small by a unit lies close to the skin, but within it.
-                score = float(np.mean(distance)) + 0.2 * float(np.mean(depth > 0.015))
+                score = misfit(v, 0.015)
                 if score < best[0] - 1e-9:
                     best = (score, v, unit, up)
     score, v, unit, up = best
@@ -257,6 +255,20 @@ def place_on_body(
             " physxnet rest writes (A-pose, Y up, origin in the pelvis), and export again."
         )
     return v, unit, up
+
+
+def skin_misfit(skin: TriMesh) -> Callable[[Float[np.ndarray, "vertices 3"], float], float]:
+    """How badly vertices fit the body [m]: their mean distance, and how many lie deeper than so."""
+    points = np.asarray(skin.vertices)
+    normals = np.asarray(vertex_normals(skin.vertices, skin.faces))
+    tree = KDTree(points)
+
+    def misfit(vertices: Float[np.ndarray, "vertices 3"], deep: float) -> float:
+        distance, nearest = tree.query(vertices)
+        depth = np.einsum("ij,ij->i", points[nearest] - vertices, normals[nearest])
+        return float(np.mean(distance)) + 0.2 * float(np.mean(depth > deep))
+
+    return misfit
 
 
 def guess_template(

@@ -25,40 +25,28 @@ from ..garment import (
     template,
     weld,
 )
-from ..geometry import TriMesh, make_mesh, vertex_normals
+from ..geometry import make_mesh
 from ..uv import bind, garment_map_rows, make_atlas
 from ._drape import drape
 from ._garment import (
     HANGS,
     LONG,
     NEAREST,
-    UNITS,
     carried,
     guess_template,
     hangs_off,
     load_garment,
     place_on_body,
 )
+from ._like import place_like
 from ._mesh_file import mesh_name, read_mesh
 from ._obj import write_obj
 
 # Shares and lengths beyond which a garment is worth a word [1], [m].
 _INSIDE, _FINE, _MISSED = 0.02, 0.003, 0.1
-# Sizes within which meshes are alike, and what turning one has to gain [m].
-_UNLIKE, _TURNED = 0.1, 0.001
-# Rotations that make an axis of a file Y.
-_UPRIGHT = {
-    "Y": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    "Z": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
-    "X": ((0, -1, 0), (1, 0, 0), (0, 0, 1)),
-}
 # Share inside the body from which a garment may lie elsewhere, and how much nearer to the skin
 # it has to be where it belongs.
 _ELSEWHERE, _NEARER = 0.1, 0.85
-# Garments this much longer or shorter than a template (a logarithm) keep their size.
-_ITS_SIZE = 0.2
-# How far such a one is tried up and down, to the front and back [m].
-_RISES, _ADVANCES = np.linspace(-0.08, 0.08, 9), np.linspace(-0.03, 0.03, 7)
 # Lifting ends a little short of what it aims at.
 _LIFT = 1.3
 
@@ -136,7 +124,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     except MeshError as error:
         problems.append(str(error).partition(": ")[2])
         # The template whose place it fills best; the user may know better.
-        nearest = min(TEMPLATES, key=lambda t: _like(raw.vertices, template(t), skin)[2])
+        nearest = min(TEMPLATES, key=lambda t: place_like(raw.vertices, template(t), skin)[2])
         options.append(f"--like {nearest}")
         health = mesh_health(make_mesh(raw.vertices, raw.faces, raw.uv, raw.uv_faces))
         nan = float("nan")
@@ -175,7 +163,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
     if inside > _ELSEWHERE:
         # Worn the wrong way round or at another height: lifting it out would ruin it.
-        placed, told, _ = _like(raw.vertices, template(garment.template), skin)
+        placed, told, _ = place_like(raw.vertices, template(garment.template), skin)
         there, _ = clearance(skin, np.asarray(placed, np.float32))
         nearer = float(np.mean(np.abs(there))) < _NEARER * float(np.mean(np.abs(distance)))
         share = float(np.mean(there < NEAREST))
@@ -266,7 +254,7 @@ def fit_garment(
         v, unit, up = place_on_body(path, raw.vertices, body)
         done.append(f"read as {unit}, {up} up.")
     else:
-        v, told, _ = _like(raw.vertices, template(like), skin)
+        v, told, _ = place_like(raw.vertices, template(like), skin)
         done.append(told)
     mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
     before = mesh_health(mesh)
@@ -316,70 +304,6 @@ def fit_garment(
         None if mesh.uv_faces is None else np.asarray(mesh.uv_faces),
     )
     return done, inspect_garment(out, body=body)
-
-
-def _like(vertices: np.ndarray, wanted: Garment, skin: TriMesh) -> tuple[np.ndarray, str, float]:
-    """The mesh turned, scaled and moved onto a template's box, how, and how far off it is [m].
-
-    Whichever axis is up and wherever the front is are found by the mean distance from the
-    skin; sizes count as well, so that trousers aren't taken for a top.
-    """
-    x = np.asarray(wanted.mesh.vertices, np.float64)
-    low, high = x.min(axis=0), x.max(axis=0)
-    tried = []
-    for up, turns in _UPRIGHT.items():
-        upright = vertices @ np.array(turns, np.float64).T
-        for quarter in range(4):
-            size = np.ptp(upright, axis=0)
-            if size[1] > 0:
-                scale = _in_its_unit(float((high - low)[1] / size[1]))
-                unlike = float(np.mean(np.abs(scale * size - (high - low))))
-                # Hung from where it is held: neck or waist.
-                held = upright.min(axis=0) + size * [0.5, 1.0, 0.5]
-                placed = (upright - held) * scale + np.where(
-                    [False, True, False], high, 0.5 * (low + high)
-                )
-                tried.append((unlike, up, quarter, scale, placed))
-            upright = upright[:, [2, 1, 0]] * [1.0, 1.0, -1.0]
-    alike = min((t[0] for t in tried), default=0.0) + _UNLIKE
-    best = (vertices, "it has no height.", np.inf)
-    for unlike, up, quarter, scale, placed in tried:
-        # What has another shape altogether needn't be compared with the skin.
-        if unlike > alike:
-            continue
-        distance, _ = clearance(skin, placed.astype(np.float32))
-        off = float(np.mean(np.abs(distance))) + unlike
-        # A mesh that could as well stay as it is isn't turned.
-        if off + (_TURNED if quarter else 0.0) < best[2]:
-            about = f", turned by {90 * quarter} degrees about it" if quarter else ""
-            told = f"scaled by {scale:.4g}, {up} up{about}, moved to where a {wanted.template} is."
-            best = (placed, told, off)
-    placed, told, off = best
-    return _settled(placed, skin), told, off
-
-
-def _settled(placed: np.ndarray, skin: TriMesh) -> np.ndarray:
-    """Moved up or down, to the front or back by a few centimetres, to where it fits best."""
-    points, normals = (
-        np.asarray(skin.vertices),
-        np.asarray(vertex_normals(skin.vertices, skin.faces)),
-    )
-    tree = KDTree(points)
-
-    def misfit(shift: np.ndarray) -> float:
-        moved = placed + shift
-        distance, nearest = tree.query(moved)
-        depth = np.einsum("ij,ij->i", points[nearest] - moved, normals[nearest])
-        return float(distance.mean() + 0.2 * np.mean(depth > 0) + 0.1 * np.abs(shift).sum())
-
-    ways = [np.array([0.0, y, z]) for y in _RISES for z in _ADVANCES]
-    return placed + min(ways, key=misfit)
-
-
-def _in_its_unit(scale: float) -> float:
-    """A unit's own scale, if a garment is of about the wanted size in it."""
-    near = min(UNITS.values(), key=lambda s: abs(np.log(scale / s)))
-    return near if abs(np.log(scale / near)) < _ITS_SIZE else scale
 
 
 def _apart(vertices: np.ndarray) -> dict[Template, float]:

@@ -11,21 +11,16 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ..errors import MissingDependencyError, MotionError
-from ._motion import slerp
+from ..errors import MotionError
+from ._gltf_document import MAX_BYTES, parse_gltf
+from ._gltf_track import track_at
 from ._source import MAX_JOINT_FRAMES, nominal_rate
 
-_MAX_BYTES = 1_000_000_000
 _MAX_NODES = 20_000
 _MOST_KEYS = 100_000_000
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _LENGTHS = {"translation": 3, "rotation": 4, "scale": 3}
-# Extensions that hide numbers, and what undoes them.
-_PACKED = {
-    "EXT_meshopt_compression": "npx @gltf-transform/cli copy IN OUT",
-    "KHR_draco_mesh_compression": "npx @gltf-transform/cli copy IN OUT",
-}
 # Where VRM says which node is which bone: of a person, of a clip, and its version 0.
 _HUMANOID = ("VRMC_vrm", "VRMC_vrm_animation", "VRM")
 
@@ -55,14 +50,7 @@ class GltfFile:
     def __init__(self, path: str | pathlib.Path) -> None:
         self.path = pathlib.Path(path)
         self._buffers: dict[int, bytes] = {}
-        self.document = _parsed(self.path)
-        for packed in _PACKED.keys() & set(self.document.extensionsRequired or ()):
-            raise MotionError.at(
-                self.path,
-                None,
-                f"its numbers are compressed ({packed}), which isn't read",
-                f"Unpack it: {_PACKED[packed]}",
-            )
+        self.document = parse_gltf(self.path)
         nodes = self.document.nodes
         if not nodes or len(nodes) > _MAX_NODES:
             raise self.broken(f"{len(nodes)} nodes")
@@ -171,7 +159,7 @@ class GltfFile:
             place = {k: np.tile(v, (len(at), 1)) for k, v in self.local(n).items()}
             for kind in place.keys() & {k for m, k in tracks if m == n}:
                 keys, values, mode = tracks[n, kind]
-                place[kind] = _at(keys, values, mode, at, kind)
+                place[kind] = track_at(keys, values, mode, at, kind)
             self._put(out, n, Rotation.from_quat(place["rotation"]).as_matrix(), place)
         return out
 
@@ -292,7 +280,7 @@ class GltfFile:
         if track is None:
             return None
         keys, values, mode = track
-        return _at(keys, values, mode, times, "weights")
+        return track_at(keys, values, mode, times, "weights")
 
     def _buffer(self, which: object) -> bytes:
         n = self.index(which, self.document.buffers, "buffer")
@@ -320,7 +308,7 @@ class GltfFile:
                 f"its buffer '{uri[:60]}' is outside its folder",
                 "Put it beside the file, or export a .glb; nothing else is opened",
             )
-        if not file.is_file() or file.stat().st_size > _MAX_BYTES:
+        if not file.is_file() or file.stat().st_size > MAX_BYTES:
             raise MotionError.at(
                 self.path,
                 None,
@@ -358,81 +346,3 @@ def nearest_turns(
     flip = np.linalg.det(u @ v) < 0
     u[..., 2] = np.where(flip[..., None], -u[..., 2], u[..., 2])
     return u @ v
-
-
-def _parsed(path: pathlib.Path) -> Any:
-    try:
-        import pygltflib
-    except ImportError as error:
-        raise MissingDependencyError(
-            "Reading glTF needs pygltflib: pip install 'physxnet-jax[gltf]'."
-        ) from error
-    if not path.is_file():
-        raise MotionError.at(path, None, "no such file", "Check the path")
-    if path.stat().st_size > _MAX_BYTES:
-        raise MotionError.at(path, None, "over 1 GB", "Cut the clip into shorter files")
-    binary = path.read_bytes()[:4] == b"glTF"
-    try:
-        loader = pygltflib.GLTF2()
-        document: Any = (loader.load_binary if binary else loader.load_json)(str(path))
-        version = str(document.asset.version)
-    # The library fails in as many ways as a file can be broken.
-    except Exception as error:
-        raise MotionError.at(
-            path,
-            None,
-            f"not a glTF file ({type(error).__name__}: {error})"[:300],
-            "Export it again",
-        ) from error
-    if document is None or not version.startswith("2"):
-        raise MotionError.at(path, None, f"glTF {version}", "Export it as glTF 2.0")
-    return document
-
-
-def _at(
-    times: Float[np.ndarray, " keys"],
-    values: Float[np.ndarray, "rows n"],
-    mode: str,
-    at: Float[np.ndarray, " frames"],
-    kind: str,
-) -> Float[np.ndarray, "frames n"]:
-    """A track at given times."""
-    # Later than `at` by less than a rounding error is not later.
-    low = np.clip(np.searchsorted(times, at + 1e-6, side="right") - 1, 0, len(times) - 1)
-    high = np.minimum(low + 1, len(times) - 1)
-    span = np.maximum(times[high] - times[low], 1e-9)
-    t = np.clip((at - times[low]) / span, 0.0, 1.0)[:, None]
-    if mode == "STEP":
-        out = values[low]
-    elif mode == "CUBICSPLINE":
-        keys = values.reshape(len(times), 3, -1)
-        d = span[:, None]
-        a, b = keys[low, 1], keys[high, 1]
-        va, vb = d * keys[low, 2], d * keys[high, 0]
-        out = (
-            (2 * t**3 - 3 * t**2 + 1) * a
-            + (t**3 - 2 * t**2 + t) * va
-            + (3 * t**2 - 2 * t**3) * b
-            + (t**3 - t**2) * vb
-        )
-    elif kind == "rotation":
-        out = _slerp(values[low], values[high], t)
-    else:
-        out = values[low] + t * (values[high] - values[low])
-    if kind == "rotation":
-        length = np.linalg.norm(out, axis=1, keepdims=True)
-        out = np.where(length > 1e-9, out / np.maximum(length, 1e-9), (0.0, 0.0, 0.0, 1.0))
-    return out
-
-
-def _slerp(
-    a: Float[np.ndarray, "n 4"], b: Float[np.ndarray, "n 4"], t: Float[np.ndarray, "n 1"]
-) -> Float[np.ndarray, "n 4"]:
-    return slerp(_unit(a), _unit(b), t)
-
-
-def _unit(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Of length one; a key of zeros turns nothing."""
-    length = np.linalg.norm(q, axis=1, keepdims=True)
-    ok = (length > 1e-9) & np.isfinite(length)
-    return np.where(ok, q / np.where(ok, length, 1.0), (0.0, 0.0, 0.0, 1.0))
