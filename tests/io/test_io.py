@@ -158,7 +158,7 @@ def test_quads_split_along_the_shorter_diagonal_and_negative_indices_count_back(
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0\nv 3 0 0\nv 4 1 0\nv 1 1 0\nf -4 -3 -2 -1\n")
     mesh = read_obj(path)
-    assert mesh.polygons == 1 and len(mesh.faces) == 2
+    assert mesh.count == 1 and len(mesh.faces) == 2
     assert {1, 3} <= set(mesh.faces[0]) and {1, 3} <= set(mesh.faces[1])
 
 

@@ -55,7 +55,7 @@ def test_every_format_holds_the_same_mesh(suffix, trousers, tmp_path):
     mesh = read_mesh(saved(tmp_path, suffix, trousers))
     assert mesh.vertices.shape == v.shape, "what lies on a seam is one vertex"
     np.testing.assert_allclose(mesh.vertices[mesh.faces], v[faces], atol=1e-6)
-    assert mesh.polygons == len(faces)
+    assert mesh.count == len(faces)
     if suffix == ".stl":
         assert mesh.uv is None
     else:

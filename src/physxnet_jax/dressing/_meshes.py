@@ -53,7 +53,9 @@ def animated_meshes(
         uv_faces = None if g.mesh.uv_faces is None else np.asarray(g.mesh.uv_faces)
         colour = _COLOURS[k % len(_COLOURS)]
         faces = np.asarray(g.mesh.faces)
-        meshes.append(AnimatedMesh(g.name, positions[g.name], faces, uv, uv_faces, colour))
+        meshes.append(
+            AnimatedMesh(g.name, positions[g.name], faces, uv, uv_faces, colour, g.polygons)
+        )
     return tuple(meshes)
 
 

@@ -21,6 +21,7 @@ from ._repair import (
     decimate as decimate,
     mesh_health as mesh_health,
     orient as orient,
+    polygons_left as polygons_left,
     subdivide as subdivide,
     weld as weld,
 )

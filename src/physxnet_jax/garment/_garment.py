@@ -6,7 +6,7 @@ from typing import Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from ..geometry import TriMesh
+from ..geometry import Polygons, TriMesh
 from ..typing import pytree
 
 Template = Literal["top", "bottom", "dress"]
@@ -86,6 +86,8 @@ class Garment:
         fabric: Material.
         template: The map this garment is dressed by.
         name: Name used in tables and files.
+        polygons: The faces and materials of the file that it came from, to be written
+            again; None where triangles are all there is.
     """
 
     mesh: TriMesh
@@ -97,6 +99,7 @@ class Garment:
     fabric: Fabric = dataclasses.field(metadata={"static": True})
     template: Template = dataclasses.field(metadata={"static": True})
     name: str = dataclasses.field(metadata={"static": True})
+    polygons: Polygons | None = dataclasses.field(default=None, metadata={"static": True})
 
     @property
     def num_vertices(self) -> int:

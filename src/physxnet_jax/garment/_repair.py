@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from ..errors import MeshError, MissingDependencyError
 from ..geometry import (
+    Polygons,
     TriMesh,
     boundary_loops,
     connected_components,
@@ -197,6 +198,45 @@ def _split(
     (a, b, c), (ma, mb, mc) = faces[every].T, middle[every].T
     out += [np.stack(t, 1) for t in ((a, mc, mb), (mc, b, ma), (mb, ma, c), (ma, mb, mc))]
     return x, np.concatenate(out)
+
+
+def polygons_left(
+    polygons: Polygons, vertices: Float[np.ndarray, "before 3"], mesh: TriMesh
+) -> Polygons | None:
+    """Polygons over a mesh that was welded, cleaned and turned round since.
+
+    Args:
+        polygons: What they were before.
+        vertices: The vertices then, in the same place [m].
+        mesh: The mesh now.
+
+    Returns:
+        Those that are left, the way round that their triangles are now; None if not
+        every triangle is part of one.
+    """
+    x, faces = _arrays(mesh)
+    far, row = (np.asarray(a) for a in KDTree(x).query(np.asarray(vertices, np.float64)))
+    used = np.unique(polygons.corners)
+    left = {tuple(sorted(f)): tuple(f) for f in faces.tolist()}
+    keep, turned, count = [], [], 0
+    for p, (start, n) in enumerate(zip(polygons.starts, polygons.counts, strict=True)):
+        ring = row[polygons.corners[start : start + n]].tolist()
+        # Cut from either end of a diagonal, triangles have different corners.
+        cuts = [ring, ring[1:] + ring[:1]] if n == 4 else [ring]
+        for r in cuts:
+            fan = [(r[0], r[k], r[k + 1]) for k in range(1, n - 1)]
+            found = [left.get(tuple(sorted(f))) for f in fan]
+            if len(set(ring)) == n and None not in found:
+                keep.append(p)
+                count += n - 2
+                a, b, c = fan[0]
+                if found[0] not in ((a, b, c), (b, c, a), (c, a, b)):
+                    turned.append(len(keep) - 1)
+                break
+    if count != len(faces) or float(far[used].max()) > 2 * WELD:
+        return None
+    moved = polygons.chosen(keep).at(row)
+    return None if moved is None else moved.reversed(turned)
 
 
 def decimate(mesh: TriMesh, edge: float) -> TriMesh:

@@ -14,6 +14,12 @@ from ._frames import each_frame as each_frame
 from ._intersect import self_intersections as self_intersections
 from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
 from ._normals import face_normals as face_normals, vertex_normals as vertex_normals
+from ._polygons import (
+    Material as Material,
+    Polygons as Polygons,
+    joined_polygons as joined_polygons,
+    make_material as make_material,
+)
 from ._raycast import RayHits as RayHits, cast_rays as cast_rays
 from ._rotation import (
     matrix_from_quaternion as matrix_from_quaternion,

@@ -5,6 +5,8 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float, Int
 
+from ..geometry import Polygons
+
 
 @dataclasses.dataclass(frozen=True)
 class AnimatedMesh:
@@ -17,6 +19,7 @@ class AnimatedMesh:
         uv: Texture coordinates, shape [uvs, 2]; or None.
         uv_faces: Corners in ``uv``, shape [faces, 3]; or None.
         colour: Display colour, linear RGB in [0, 1].
+        polygons: What the triangles were cut from, with materials; or None.
     """
 
     name: str
@@ -25,6 +28,21 @@ class AnimatedMesh:
     uv: Float[np.ndarray, "uvs 2"] | None = None
     uv_faces: Int[np.ndarray, "faces 3"] | None = None
     colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    polygons: Polygons | None = None
+
+    @property
+    def looks(self) -> list[tuple[str, tuple[float, float, float], Int[np.ndarray, " faces"]]]:
+        """Name, colour and triangles of each material; the mesh's own for what has none."""
+        p = self.polygons
+        if p is None or not p.materials:
+            return [(self.name, self.colour, np.arange(len(self.faces)))]
+        of_face = p.material[p.of_triangle]
+        found = [
+            (m.name, self.colour if m.colour is None else m.colour, np.flatnonzero(of_face == k))
+            for k, m in enumerate(p.materials)
+        ]
+        found.append((self.name, self.colour, np.flatnonzero(of_face < 0)))
+        return [look for look in found if len(look[2])]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +54,9 @@ class StillMesh:
         faces: Triangles, shape [faces, 3].
         uv: Texture coordinates, shape [uvs, 2]; None if any face lacks them.
         uv_faces: Corners in ``uv``, shape [faces, 3]; None likewise.
-        polygons: Number of faces before triangulation.
+        polygons: The faces before triangulation, with materials; None where they can't be
+            told from the triangles any more.
+        count: How many there were.
         parts: Names of the meshes that it was put together from, where files name them.
     """
 
@@ -44,7 +64,8 @@ class StillMesh:
     faces: Int[np.ndarray, "faces 3"]
     uv: Float[np.ndarray, "uvs 2"] | None
     uv_faces: Int[np.ndarray, "faces 3"] | None
-    polygons: int
+    polygons: Polygons | None
+    count: int
     parts: tuple[str, ...] = ()
 
 

@@ -147,6 +147,7 @@ def load_garment(
         mesh_name(path),
         body,
     )
+    garment = dataclasses.replace(garment, polygons=raw.polygons)
     report = _report(str(path), unit, up, v, raw.faces, inside, distance, kind)
     return garment, report
 

@@ -17,8 +17,9 @@ MAX_FRAMES = 300
 def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
     """Writes meshes as one binary glTF, playing in a loop in most viewers.
 
-    Frame 0 is the mesh, every other frame a morph target with positions and normals;
-    one animation goes through them, linear between frames. Where texture coordinates
+    Frame 0 is the mesh, every other frame a morph target with positions and normals; one
+    animation goes through them, linear between frames. Each material has a primitive of its
+    own, all over the same vertices. Where texture coordinates
     part at a seam the vertex is doubled, as glTF asks: the first vertices stay in order
     only for meshes without ``uv``.
 
@@ -94,25 +95,31 @@ class _Builder:
             }
             for k in range(1, len(x))
         ]
-        gltf.materials.append(
-            lib.Material(
-                name=m.name,
-                doubleSided=True,
-                pbrMetallicRoughness=lib.PbrMetallicRoughness(
-                    baseColorFactor=[*map(float, m.colour), 1.0],
-                    metallicFactor=0.0,
-                    roughnessFactor=0.8,
-                ),
+        primitives = []
+        for name, colour, chosen in m.looks:
+            gltf.materials.append(
+                lib.Material(
+                    name=name,
+                    doubleSided=True,
+                    pbrMetallicRoughness=lib.PbrMetallicRoughness(
+                        baseColorFactor=[*map(float, colour), 1.0],
+                        metallicFactor=0.0,
+                        roughnessFactor=0.8,
+                    ),
+                )
             )
-        )
-        primitive = lib.Primitive(
-            attributes=lib.Attributes(**attributes),
-            indices=self.store(faces.reshape(-1).astype(np.uint32), "SCALAR", index=True),
-            material=len(gltf.materials) - 1,
-            targets=targets,
-        )
+            primitives.append(
+                lib.Primitive(
+                    attributes=lib.Attributes(**attributes),
+                    indices=self.store(
+                        faces[chosen].reshape(-1).astype(np.uint32), "SCALAR", index=True
+                    ),
+                    material=len(gltf.materials) - 1,
+                    targets=targets,
+                )
+            )
         gltf.meshes.append(
-            lib.Mesh(name=m.name, primitives=[primitive], weights=[0.0] * len(targets))
+            lib.Mesh(name=m.name, primitives=primitives, weights=[0.0] * len(targets))
         )
         gltf.nodes.append(lib.Node(name=m.name, mesh=len(gltf.meshes) - 1))
         gltf.scenes[0].nodes.append(len(gltf.nodes) - 1)

@@ -6,9 +6,10 @@ import pathlib
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ..errors import FormatError, PhysXNetError
+from ..geometry import Polygons, make_material
 from ..motion import GltfFile, Motion, drive
 from ._moving import Moving, welded
 
@@ -154,7 +155,30 @@ def _primitive(
         uv = np.asarray(file.accessor(attributes.TEXCOORD_0), float)
         # Images begin at the top in glTF.
         uv = uv * [1.0, -1.0] + [0.0, 1.0] if uv.shape == (len(x), 2) else None
-    return Moving(name, positions, faces, uv, None if uv is None else faces)
+    drawn = _polygons(file, primitive, faces, textured=uv is not None)
+    return Moving(name, positions, faces, uv, None if uv is None else faces, polygons=drawn)
+
+
+def _polygons(
+    file: GltfFile, primitive: object, faces: Int[np.ndarray, "faces 3"], *, textured: bool
+) -> Polygons:
+    """Triangles with the material of their primitive."""
+    count, materials = len(faces), ()
+    which = primitive.material  # pyright: ignore[reportAttributeAccessIssue]
+    if which is not None:
+        told = file.document.materials[file.index(which, file.document.materials, "material")]
+        plain = told.pbrMetallicRoughness
+        rgba = None if plain is None else plain.baseColorFactor
+        name = str(told.name or f"material{which}")
+        materials = (make_material(name, [1.0, 1.0, 1.0] if rgba is None else rgba[:3]),)
+    corners = faces.reshape(-1)
+    return Polygons(
+        np.full(count, 3, np.int32),
+        corners,
+        corners if textured else None,
+        np.full(count, len(materials) - 1, np.int32),
+        materials,
+    )
 
 
 def _check_size(file: GltfFile, frames: int, vertices: int) -> None:
@@ -167,7 +191,7 @@ def _moved(file: GltfFile, part: Moving, world: Float[np.ndarray, "frames 4 4"])
     _check_size(file, len(world), part.positions.shape[1])
     x = np.broadcast_to(part.positions, (len(world), *part.positions.shape[1:]))
     turned = np.einsum("fab,fvb->fva", world[:, :3, :3], x) + world[:, None, :3, 3]
-    return Moving(part.name, turned.astype(np.float32), part.faces, part.uv, part.uv_faces)
+    return dataclasses.replace(part, positions=turned.astype(np.float32))
 
 
 def _skinned(
@@ -200,7 +224,7 @@ def _skinned(
     top = min(range(len(joints)), key=lambda k: rank[joints[k]])
     place = still[joints[top]] @ binds[top]
     bind = part.positions[0] @ place[:3, :3].T + place[:3, 3]
-    return Moving(part.name, out, part.faces, part.uv, part.uv_faces, bind.astype(np.float32))
+    return dataclasses.replace(part, positions=out, bind=bind.astype(np.float32))
 
 
 def _joint_weights(

@@ -2,6 +2,7 @@
 
 import base64
 import html
+import itertools
 import json
 import pathlib
 import tempfile
@@ -63,10 +64,11 @@ const stop = frame => {
   tell(frame);
 };
 const wear = (name, worn) => {
-  const material = view.model.materials.find(m => m.name === name);
-  const rgba = [...told.meshes[name], worn ? 1 : 0];
-  material.setAlphaMode(worn ? 'OPAQUE' : 'MASK');
-  material.pbrMetallicRoughness.setBaseColorFactor(rgba);
+  for (const [number, colour] of told.meshes[name]) {
+    const material = view.model.materials[number];
+    material.setAlphaMode(worn ? 'OPAQUE' : 'MASK');
+    material.pbrMetallicRoughness.setBaseColorFactor([...colour, worn ? 1 : 0]);
+  }
 };
 view.addEventListener('load', () => {
   for (const name of Object.keys(told.meshes)) {
@@ -127,7 +129,7 @@ def write_html(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
         told = {
             "frames": len(meshes[0].positions),
             "fps": fps,
-            "meshes": {m.name: list(map(float, m.colour)) for m in meshes},
+            "meshes": _materials(meshes),
             "model": base64.b64encode(model.read_bytes()).decode(),
         }
     # The whole clip stays in sight: its ball fills the view of 30 degrees.
@@ -149,3 +151,12 @@ def write_html(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
         page = page.replace(name, text)
     with whole_file(path) as part:
         part.write_text(page, encoding="utf-8")
+
+
+def _materials(meshes: Sequence[AnimatedMesh]) -> dict[str, list[tuple[int, list[float]]]]:
+    """Numbers of each mesh's materials in the glTF, and their colours."""
+    number = itertools.count()
+    return {
+        m.name: [(next(number), list(map(float, colour))) for _, colour, _ in m.looks]
+        for m in meshes
+    }

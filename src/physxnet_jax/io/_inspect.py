@@ -1,9 +1,8 @@
-"""What a garment file is like, what is wrong with it, and the same made wearable."""
+"""What a garment file is like, and what is wrong with it."""
 
 import dataclasses
 import pathlib
 import shlex
-from collections.abc import Callable
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -15,40 +14,28 @@ from ..garment import (
     Garment,
     MeshHealth,
     Template,
-    clean,
     clearance,
-    decimate,
-    lift_out,
     mesh_health,
-    orient,
-    subdivide,
     template,
-    weld,
 )
 from ..geometry import make_mesh
 from ..uv import bind, garment_map_rows, make_atlas
-from ._drape import drape
 from ._garment import (
     HANGS,
     LONG,
     NEAREST,
-    carried,
-    guess_template,
     hangs_off,
     load_garment,
     place_on_body,
 )
 from ._like import place_like
 from ._mesh_file import mesh_name, read_mesh
-from ._obj import write_obj
 
 # Shares and lengths beyond which a garment is worth a word [1], [m].
 _INSIDE, _FINE, _MISSED = 0.02, 0.003, 0.1
 # Share inside the body from which a garment may lie elsewhere, and how much nearer to the skin
 # it has to be where it belongs.
 _ELSEWHERE, _NEARER = 0.1, 0.85
-# Lifting ends a little short of what it aims at.
-_LIFT = 1.3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +117,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         nan = float("nan")
         command = _command(path, options)
         return Inspection(
-            path, None, None, size, health, raw.polygons, nan, nan, nan, nan, nan, None, {}, nan,
+            path, None, None, size, health, raw.count, nan, nan, nan, nan, nan, None, {}, nan,
             tuple(problems), (), command,
         )  # fmt: skip
     mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
@@ -202,108 +189,10 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
             " the closest skin."
         )
     return Inspection(
-        path, unit, up, size, health, raw.polygons, float(np.median(np.abs(distance))),
+        path, unit, up, size, health, raw.count, float(np.median(np.abs(distance))),
         float(distance.max()), hangs, inside, outward, garment.template, _apart(v), hit_rate,
         tuple(problems), tuple(notes), _command(path, options) if problems else None,
     )  # fmt: skip
-
-
-def fit_garment(
-    path: str | pathlib.Path,
-    out: str | pathlib.Path,
-    *,
-    like: Template | None = None,
-    edge_length: float | None = None,
-    coarser: float | None = None,
-    draped: bool = False,
-    body: Body | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> tuple[list[str], Inspection]:
-    """Writes a garment that can be worn: on the body, clean, oriented and out of the skin.
-
-    Args:
-        path: A file that `read_mesh` reads.
-        out: The ``.obj`` to write: metres, Y up, on the body at rest.
-        like: Turn, scale and move it onto this template's place instead of guessing its unit.
-        edge_length: Split edges longer than this [m].
-        coarser: Before that, decimate to about this edge length [m]; texture coordinates
-            are lost.
-        draped: At last let it down onto the body, by `drape`.
-        body: The body; the built-in one by default.
-        progress: Called by `drape`.
-
-    Returns:
-        What was done, a sentence each, and how the result looks.
-
-    Raises:
-        FormatError: A file that can't be read.
-        MeshError: No unit and axis puts it on the body, and ``like`` isn't given; ``out``
-            is the file itself; it falls off the body.
-        MissingDependencyError: Decimation without fast-simplification.
-    """
-    path, out = pathlib.Path(path), pathlib.Path(out)
-    if out.suffix.lower() != ".obj":
-        raise MeshError(f"{out}: garments are written as .obj.")
-    if out.resolve() == path.resolve():
-        raise MeshError(f"{out}: would overwrite the file it is made from. Name another one.")
-    body = load_body() if body is None else body
-    raw = read_mesh(path)
-    skin = body.rest_mesh()
-    done = []
-    if like is None:
-        v, unit, up = place_on_body(path, raw.vertices, body)
-        done.append(f"read as {unit}, {up} up.")
-    else:
-        v, told, _ = place_like(raw.vertices, template(like), skin)
-        done.append(told)
-    mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
-    before = mesh_health(mesh)
-    if before.coincident_vertices:
-        mesh = weld(mesh)
-        done.append(f"welded {before.coincident_vertices:,} vertices onto their neighbours.")
-    faces, vertices = int(mesh.faces.shape[0]), int(mesh.vertices.shape[0])
-    mesh = clean(mesh)
-    gone = faces - int(mesh.faces.shape[0]), vertices - int(mesh.vertices.shape[0])
-    if any(gone):
-        done.append(f"removed {gone[0]:,} faces and {gone[1]:,} vertices.")
-    turned = orient(mesh, skin)
-    count = int(np.sum(np.any(np.asarray(turned.faces) != np.asarray(mesh.faces), axis=1)))
-    if count:
-        done.append(f"turned {count:,} faces round.")
-    mesh = turned
-    count = int(mesh.faces.shape[0])
-    if coarser is not None:
-        textured = mesh.uv is not None
-        mesh = decimate(mesh, coarser)
-        if int(mesh.faces.shape[0]) < count:
-            lost = ", without its texture coordinates" if textured else ""
-            done.append(f"decimated {count:,} faces to {mesh.faces.shape[0]:,}{lost}.")
-    count = int(mesh.faces.shape[0])
-    if edge_length is not None:
-        mesh = subdivide(mesh, edge_length)
-        if int(mesh.faces.shape[0]) > count:
-            done.append(f"split {count:,} faces into {mesh.faces.shape[0]:,}.")
-    moved, low = lift_out(
-        skin, np.asarray(mesh.vertices), np.asarray(mesh.faces), _LIFT * NEAREST, iterations=12
-    )
-    if low.any():
-        done.append(f"lifted {int(low.sum()):,} vertices out of the body or off it.")
-    if draped:
-        kind = guess_template(moved, np.asarray(mesh.faces)) if like is None else like
-        # Lifted over what it will slide down from, its edges are longer than it was made.
-        hung = carried(mesh, kind, path.name, body)
-        lain = drape(hung, start=moved, body=body, progress=progress)
-        far = np.linalg.norm(lain - moved, axis=1)
-        done.append(f"let it down: it moved by {1e3 * float(np.median(far)):.0f} mm.")
-        moved, _ = lift_out(skin, lain, np.asarray(mesh.faces), _LIFT * NEAREST, iterations=12)
-    write_obj(
-        out,
-        moved,
-        np.asarray(mesh.faces),
-        None if mesh.uv is None else np.asarray(mesh.uv),
-        None if mesh.uv_faces is None else np.asarray(mesh.uv_faces),
-    )
-    return done, inspect_garment(out, body=body)
 
 
 def _apart(vertices: np.ndarray) -> dict[Template, float]:

@@ -114,7 +114,7 @@ def _still(path: pathlib.Path, parts: Sequence[Moving]) -> StillMesh:
         raise FormatError(f"{path}: positions that aren't finite. Export it again.")
     if whole.uv is not None and not (np.abs(whole.uv) < _FARTHEST).all():
         raise FormatError(f"{path}: texture coordinates that aren't finite. Export it again.")
-    count = len(whole.faces)
+    count = len(whole.faces if whole.polygons is None else whole.polygons.counts)
     whole = welded(whole)
     if not len(whole.faces):
         raise FormatError(f"{path}: all its faces are points or lines. Export it again.")
@@ -123,6 +123,7 @@ def _still(path: pathlib.Path, parts: Sequence[Moving]) -> StillMesh:
         whole.faces,
         whole.uv,
         whole.uv_faces,
+        whole.polygons,
         count,
         tuple(sorted({p.name for p in parts})),
     )

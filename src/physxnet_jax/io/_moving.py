@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import FormatError
+from ..geometry import Polygons, joined_polygons
 
 
 @dataclasses.dataclass(frozen=True)
@@ -21,6 +22,7 @@ class Moving:
         uv: Texture coordinates; or None.
         uv_faces: Corners in ``uv``; or None.
         bind: The pose in which a skin was bound, shape [vertices, 3]; or None.
+        polygons: What the triangles were cut from; or None.
     """
 
     name: str
@@ -29,6 +31,7 @@ class Moving:
     uv: Float[np.ndarray, "uvs 2"] | None = None
     uv_faces: Int[np.ndarray, "faces 3"] | None = None
     bind: Float[np.ndarray, "vertices 3"] | None = None
+    polygons: Polygons | None = None
 
 
 def named(
@@ -55,6 +58,11 @@ def joined(parts: Sequence[Moving]) -> Moving:
     first = np.cumsum([0, *(p.positions.shape[1] for p in parts)])
     faces = [p.faces + n for p, n in zip(parts, first[:-1], strict=True)]
     binds = [p.bind for p in parts]
+    drawn = [
+        (p.polygons, p.positions.shape[1], 0 if p.uv is None else len(p.uv))
+        for p in parts
+        if p.polygons is not None
+    ]
     uv = uv_faces = None
     if all(p.uv is not None and p.uv_faces is not None for p in parts):
         starts = np.cumsum([0, *(len(p.uv) for p in parts if p.uv is not None)])
@@ -71,6 +79,7 @@ def joined(parts: Sequence[Moving]) -> Moving:
         None
         if any(b is None for b in binds)
         else np.concatenate([b for b in binds if b is not None]),
+        None if len(drawn) < len(parts) else joined_polygons(drawn),
     )
 
 
@@ -83,7 +92,8 @@ def welded(part: Moving) -> Moving:
     # In the file's order, so that a mesh without seams stays as it was.
     order = np.argsort(first)
     first, rank = first[order], np.argsort(order)
-    faces = rank[index.reshape(-1)][part.faces].astype(np.int32)
+    row = rank[index.reshape(-1)]
+    faces = row[part.faces].astype(np.int32)
     whole = (
         (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     )
@@ -94,4 +104,5 @@ def welded(part: Moving) -> Moving:
         part.uv,
         None if part.uv_faces is None else part.uv_faces[whole],
         None if part.bind is None else part.bind[first],
+        None if part.polygons is None or not whole.all() else part.polygons.at(row),
     )

@@ -1,15 +1,19 @@
-"""Wavefront OBJ: polygons, texture coordinates, several objects in a file."""
+"""Wavefront OBJ: polygons, texture coordinates, materials, several objects in a file."""
 
+import contextlib
 import pathlib
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import FormatError
 from ..files import whole_file
+from ..geometry import Material, Polygons, make_material
 from ._clip import StillMesh
 
 _MAX_BYTES = 500_000_000
+_MAX_LIBRARY = 5_000_000
 
 
 def read_obj(path: str | pathlib.Path) -> StillMesh:
@@ -19,7 +23,8 @@ def read_obj(path: str | pathlib.Path) -> StillMesh:
         path: The file.
 
     Returns:
-        The mesh; vertex order is kept.
+        The mesh; vertex order is kept. Polygons keep the names of their materials, and the
+        colours that a material file beside it tells.
 
     Raises:
         FormatError: Missing, empty, binary or malformed files; indices out of range;
@@ -37,6 +42,9 @@ def read_obj(path: str | pathlib.Path) -> StillMesh:
     uv: list[list[float]] = []
     polygons: list[list[tuple[int, int]]] = []
     where: list[int] = []
+    names: dict[str, int] = {}
+    used, material = -1, list[int]()
+    libraries: list[str] = []
     for n, line in enumerate(blob.decode("utf-8", "replace").splitlines(), start=1):
         words = line.split("#")[0].split()
         if not words:
@@ -48,8 +56,13 @@ def read_obj(path: str | pathlib.Path) -> StillMesh:
         elif words[0] == "f":
             polygons.append([_corner(path, n, w, len(vertices), len(uv)) for w in words[1:]])
             where.append(n)
+            material.append(used)
             if len({c[0] for c in polygons[-1]}) < 3:
                 raise FormatError(f"{path}:{n}: a face of fewer than three vertices. Delete it.")
+        elif words[0] == "usemtl":
+            used = names.setdefault(_rest(line), len(names))
+        elif words[0] == "mtllib":
+            libraries.append(_rest(line))
     if not vertices or not polygons:
         raise FormatError(
             f"{path}: {len(vertices)} vertices and {len(polygons)} faces; a mesh needs both."
@@ -71,8 +84,51 @@ def read_obj(path: str | pathlib.Path) -> StillMesh:
         table[..., 0],
         np.asarray(uv) if has_uv else None,
         table[..., 1] if has_uv else None,
+        _drawn(polygons, material, names, _colours(path, libraries), textured=has_uv),
         len(polygons),
     )
+
+
+def _drawn(
+    polygons: list[list[tuple[int, int]]],
+    material: list[int],
+    names: dict[str, int],
+    colours: dict[str, Material],
+    *,
+    textured: bool,
+) -> Polygons:
+    corners = np.asarray([c for p in polygons for c in p], np.int32)
+    return Polygons(
+        np.asarray([len(p) for p in polygons], np.int32),
+        corners[:, 0],
+        corners[:, 1] if textured else None,
+        np.asarray(material, np.int32),
+        tuple(colours.get(name, Material(name)) for name in names),
+    )
+
+
+def _colours(path: pathlib.Path, libraries: list[str]) -> dict[str, Material]:
+    """Diffuse colours of the material files beside a mesh; what can't be read tells none."""
+    found: dict[str, Material] = {}
+    for library in libraries:
+        # Only what lies beside it: a name may lead anywhere.
+        file = path.parent / pathlib.PurePath(library.replace("\\", "/")).name
+        if not file.is_file() or file.stat().st_size > _MAX_LIBRARY:
+            continue
+        name = None
+        for line in file.read_bytes().decode("utf-8", "replace").splitlines():
+            words = line.split("#")[0].split()
+            if words[:1] == ["newmtl"]:
+                name = _rest(line)
+            elif words[:1] == ["Kd"] and name is not None:
+                with contextlib.suppress(ValueError):
+                    found[name] = make_material(name, [float(w) for w in words[1:4]])
+    return found
+
+
+def _rest(line: str) -> str:
+    """What follows the first word; names may have spaces."""
+    return "".join(line.strip().split(None, 1)[1:]).strip()
 
 
 def write_obj(
@@ -81,17 +137,57 @@ def write_obj(
     faces: Int[np.ndarray, "faces 3"],
     uv: Float[np.ndarray, "uvs 2"] | None = None,
     uv_faces: Int[np.ndarray, "faces 3"] | None = None,
+    *,
+    polygons: Polygons | None = None,
+    library: str | None = None,
 ) -> None:
-    """Writes one mesh, atomically; positions [m]."""
-    lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in np.asarray(vertices)]
-    if uv is not None and uv_faces is not None:
+    """Writes one mesh, atomically.
+
+    Args:
+        path: The file.
+        vertices: Positions [m].
+        faces: Triangles.
+        uv: Texture coordinates.
+        uv_faces: Corners in ``uv``.
+        polygons: What is written in place of the triangles, with names of materials.
+        library: Name of the material file beside it, by `write_materials`.
+    """
+    lines = [] if library is None else [f"mtllib {library}"]
+    lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in np.asarray(vertices)]
+    textured = uv is not None and uv_faces is not None
+    if textured:
         lines += [f"vt {a:.6g} {b:.6g}" for a, b in np.asarray(uv)]
-        pairs = np.stack([faces, uv_faces], axis=2) + 1
-        lines += ["f " + " ".join(f"{a}/{b}" for a, b in f) for f in pairs]
-    else:
-        lines += ["f " + " ".join(str(a) for a in f) for f in np.asarray(faces) + 1]
+    if polygons is None:
+        polygons = Polygons(
+            np.full(len(faces), 3),
+            np.asarray(faces).reshape(-1),
+            np.asarray(uv_faces).reshape(-1) if textured else None,
+            np.full(len(faces), -1),
+        )
+    words = [str(a + 1) for a in polygons.corners]
+    if textured and polygons.uv_corners is not None:
+        words = [f"{a}/{t + 1}" for a, t in zip(words, polygons.uv_corners, strict=True)]
+    used = -1
+    for start, count, which in zip(
+        polygons.starts, polygons.counts, polygons.material, strict=True
+    ):
+        if which != used and which >= 0:
+            lines.append(f"usemtl {polygons.materials[which].name}")
+        used = which
+        lines.append("f " + " ".join(words[start : start + count]))
     with whole_file(path) as part:
-        part.write_text("\n".join(lines) + "\n")
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def write_materials(path: str | pathlib.Path, materials: Sequence[Material]) -> None:
+    """Writes an MTL of the materials' names and colours, atomically."""
+    lines = []
+    for m in materials:
+        lines.append(f"newmtl {m.name}")
+        if m.colour is not None:
+            lines.append("Kd " + " ".join(f"{c:.6g}" for c in m.colour))
+    with whole_file(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _floats(path: pathlib.Path, n: int, words: list[str], count: int) -> list[float]:

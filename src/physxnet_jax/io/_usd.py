@@ -4,6 +4,7 @@
 import pathlib
 import re
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +17,10 @@ def write_usd(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: flo
     """Writes meshes as one animated stage.
 
     Each mesh is a prim under ``/Person`` with points, normals, velocities and extent
-    as time samples (frame 0 first), ``st`` texture coordinates, no subdivision, and a
-    preview material of its colour. The stage's up axis is Y, its unit the metre, its
-    rate ``fps``.
+    as time samples (frame 0 first), ``st`` texture coordinates and no subdivision. Polygons
+    and materials are those of the mesh, a subset of faces for each of several; a mesh
+    without any has a preview material of its colour. The stage's up axis is Y, its unit the
+    metre, its rate ``fps``.
 
     Args:
         path: ``.usdc``, ``.usd`` or ``.usda``; written whole or not at all.
@@ -44,7 +46,7 @@ def check_usd() -> None:
 
 
 def _write(part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
-    from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
+    from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
     stage = Usd.Stage.CreateNew(str(part))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -59,14 +61,18 @@ def _write(part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> No
     def vectors(x: np.ndarray) -> "Vt.Vec3fArray":
         return Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(x, dtype=np.float32))
 
+    def numbers(x: np.ndarray) -> "Vt.IntArray":
+        return Vt.IntArray.FromNumpy(np.ascontiguousarray(x.reshape(-1), dtype=np.int32))
+
     taken: set[str] = set()
+    looks = _Looks(stage)
     for m in meshes:
         name = _prim_name(m.name, taken)
         prim = UsdGeom.Mesh.Define(stage, f"/Person/{name}")
-        prim.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(m.faces), 3, np.int32)))
-        prim.CreateFaceVertexIndicesAttr(
-            Vt.IntArray.FromNumpy(np.ascontiguousarray(m.faces.reshape(-1), dtype=np.int32))
-        )
+        drawn = m.polygons
+        counts = np.full(len(m.faces), 3) if drawn is None else drawn.counts
+        prim.CreateFaceVertexCountsAttr(numbers(counts))
+        prim.CreateFaceVertexIndicesAttr(numbers(m.faces if drawn is None else drawn.corners))
         prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         prim.CreateDoubleSidedAttr(True)
         points, extent = prim.CreatePointsAttr(), prim.CreateExtentAttr()
@@ -84,21 +90,45 @@ def _write(part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> No
                 "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
             )
             st.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(m.uv, dtype=np.float32)))
-            st.SetIndices(
-                Vt.IntArray.FromNumpy(np.ascontiguousarray(m.uv_faces.reshape(-1), dtype=np.int32))
-            )
+            rows = None if drawn is None else drawn.uv_corners
+            st.SetIndices(numbers(m.uv_faces if rows is None else rows))
         prim.CreateDisplayColorAttr(vectors(np.asarray([m.colour])))
-        material = UsdShade.Material.Define(stage, f"/Person/Looks/{name}")
-        shader = UsdShade.Shader.Define(stage, f"/Person/Looks/{name}/surface")
-        shader.CreateIdAttr("UsdPreviewSurface")
-        shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).Set(
-            Gf.Vec3f(*(float(c) for c in m.colour))
-        )
-        shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.8)
-        material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-        UsdShade.MaterialBindingAPI.Apply(prim.GetPrim()).Bind(material)
+        binding = UsdShade.MaterialBindingAPI.Apply(prim.GetPrim())
+        parts: set[str] = set()
+        for called, colour, chosen in m.looks:
+            if len(chosen) == len(m.faces):
+                binding.Bind(looks.material(called, colour))
+                continue
+            own = drawn.of_triangle[chosen] if drawn is not None else chosen
+            subset = binding.CreateMaterialBindSubset(
+                _prim_name(called, parts), numbers(np.unique(own))
+            )
+            UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(looks.material(called, colour))
     stage.GetRootLayer().Save()
-    del stage
+
+
+class _Looks:
+    """Preview materials of a stage, one for each name and colour."""
+
+    def __init__(self, stage: Any) -> None:
+        self.stage = stage
+        self.made: dict[tuple[str, tuple[float, float, float]], Any] = {}
+        self.taken: set[str] = set()
+
+    def material(self, name: str, colour: tuple[float, float, float]) -> Any:
+        from pxr import Gf, Sdf, UsdShade
+
+        if (name, colour) not in self.made:
+            path = f"/Person/Looks/{_prim_name(name, self.taken)}"
+            material = UsdShade.Material.Define(self.stage, path)
+            shader = UsdShade.Shader.Define(self.stage, f"{path}/surface")
+            shader.CreateIdAttr("UsdPreviewSurface")
+            told = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+            told.Set(Gf.Vec3f(*(float(c) for c in colour)))
+            shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.8)
+            material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
+            self.made[name, colour] = material
+        return self.made[name, colour]
 
 
 def _prim_name(name: str, taken: set[str]) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import FormatError, MissingDependencyError
+from ..geometry import Material, Polygons, make_material
 from ._moving import Moving
 
 # Coordinates and frames that are read at most.
@@ -142,15 +143,43 @@ def _meshes(
                 if world.shape != (4, 4):
                     raise FormatError(f"{path}: {prim.GetPath()} is bound by no matrix.")
             x[k] = unit * (local @ world[:3, :3] + world[3, :3])
-        uv, uv_faces = _chart(prim, slots, faces)
-        parts.append(Moving(prim.GetName(), x, faces, uv, uv_faces))
+        uv, rows = _chart(prim, np.asarray(corners))
+        drawn = _polygons(prim, np.asarray(counts), np.asarray(corners), rows) if bound else None
+        uv_faces = None if rows is None else rows[slots]
+        parts.append(Moving(prim.GetName(), x, faces, uv, uv_faces, polygons=drawn))
     return parts
 
 
-def _chart(
-    prim: Any, slots: np.ndarray, faces: np.ndarray
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Texture coordinates `st` and their corners; none if they don't fit."""
+def _polygons(
+    prim: Any, counts: np.ndarray, corners: np.ndarray, rows: np.ndarray | None
+) -> Polygons:
+    """Faces of a prim, outwards, with the materials that it or its subsets are bound to."""
+    from pxr import UsdGeom, UsdShade
+
+    found: dict[Material, int] = {}
+
+    def number(at: Any) -> int:
+        bound = UsdShade.MaterialBindingAPI(at).ComputeBoundMaterial()[0]
+        if not bound:
+            return -1
+        surface = bound.ComputeSurfaceSource()[0]
+        told = surface.GetInput("diffuseColor") if surface else None
+        material = make_material(bound.GetPrim().GetName(), told.Get() if told else None)
+        return found.setdefault(material, len(found))
+
+    which = np.full(len(counts), number(prim), np.int32)
+    for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
+        chosen = np.asarray(subset.GetIndicesAttr().Get() or (), np.int64)
+        which[chosen[(chosen >= 0) & (chosen < len(which))]] = number(subset.GetPrim())
+    drawn = Polygons(
+        counts.astype(np.int32), corners.astype(np.int32), rows, which, tuple(found)
+    ).chosen(np.flatnonzero(counts > 2))
+    turned = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+    return drawn.reversed(np.arange(len(drawn.counts))) if turned else drawn
+
+
+def _chart(prim: Any, vertices: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Texture coordinates `st` and the row of each corner; none if they don't fit."""
     from pxr import UsdGeom
 
     st = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
@@ -161,7 +190,7 @@ def _chart(
     each = st.GetInterpolation()
     if each not in (UsdGeom.Tokens.faceVarying, UsdGeom.Tokens.vertex, UsdGeom.Tokens.varying):
         return None, None
-    corners = slots if each == UsdGeom.Tokens.faceVarying else faces
+    corners = np.arange(len(vertices)) if each == UsdGeom.Tokens.faceVarying else vertices
     if st.IsIndexed():
         index = np.asarray(st.GetIndices(), np.int64)
         if corners.max() >= len(index):
@@ -173,7 +202,7 @@ def _chart(
 
 
 def _triangles(counts: np.ndarray, corners: int) -> np.ndarray:
-    """Corners of polygons cut as fans."""
+    """Corners of polygons cut as fans, polygon after polygon."""
     if counts.min() < 0 or counts.sum() != corners:
         return np.zeros((0, 3), np.int32)
     starts = np.cumsum(counts) - counts
@@ -183,4 +212,7 @@ def _triangles(counts: np.ndarray, corners: int) -> np.ndarray:
         for s in (starts[counts == n],)
         for k in range(1, n - 1)
     ]
-    return np.concatenate(rows).astype(np.int32) if rows else np.zeros((0, 3), np.int32)
+    if not rows:
+        return np.zeros((0, 3), np.int32)
+    found = np.concatenate(rows)
+    return found[np.argsort(found[:, 0], kind="stable")].astype(np.int32)

@@ -13,7 +13,7 @@ from ._clip import AnimatedMesh
 from ._gltf import check_gltf, write_gltf
 from ._html import write_html
 from ._mdd import write_mdd
-from ._obj import write_obj
+from ._obj import write_materials, write_obj
 from ._pc2 import write_pc2
 from ._usd import check_usd, write_usd
 
@@ -55,7 +55,8 @@ def write_clip(
     ``.npz``: ``NAME_positions``, ``NAME_faces`` and ``fps``. ``.pc2``, ``.mdd``: for each
     mesh a cache and an OBJ of its first frame with the same vertex order, ``STEM_NAME.pc2``
     and ``STEM_NAME.obj``. ``.obj``: a file for each mesh and frame, ``STEM_NAME_0000.obj``;
-    what follows their numbers, of a longer clip before, is removed.
+    what follows their numbers, of a longer clip before, is removed. Where a mesh has
+    materials, ``STEM_NAME.mtl`` is beside them.
 
     Raises:
         FormatError: Another extension, or too many frames for glTF.
@@ -81,10 +82,15 @@ def write_clip(
     written = []
     for m in meshes:
         stem = f"{path.stem}_{_UNFIT.sub('_', m.name)}"
+        drawn, library = m.polygons, None
+        if drawn is not None and drawn.materials:
+            library = f"{stem}.mtl"
+            write_materials(path.with_name(library), drawn.materials)
+            written.append(path.with_name(library))
         if suffix == ".obj":
             for k, x in enumerate(m.positions):
                 frame = path.with_name(f"{stem}_{k:04d}.obj")
-                write_obj(frame, x, m.faces, m.uv, m.uv_faces)
+                write_obj(frame, x, m.faces, m.uv, m.uv_faces, polygons=drawn, library=library)
                 written.append(frame)
             # A longer clip of before would be taken for the rest of this one.
             for k in itertools.count(len(m.positions)):
@@ -99,6 +105,6 @@ def write_clip(
         else:
             write_pc2(cache, m.positions)
         shape = cache.with_suffix(".obj")
-        write_obj(shape, m.positions[0], m.faces, m.uv, m.uv_faces)
+        write_obj(shape, m.positions[0], m.faces, m.uv, m.uv_faces, polygons=drawn, library=library)
         written += [cache, shape]
     return written

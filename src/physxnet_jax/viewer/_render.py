@@ -69,15 +69,22 @@ class _Stage:
 
         centre = self.meshes[0].positions[frame].mean(axis=0)
         for k, m in enumerate(self.meshes):
+            looks = m.looks
+            painted: dict[str, Any] = {"color": looks[0][1]}
+            if len(looks) > 1:
+                paint = np.zeros((len(m.faces), 3), np.uint8)
+                for _, colour, chosen in looks:
+                    paint[chosen] = np.round(255 * np.asarray(colour))
+                painted = {"scalars": paint, "rgb": True}
             # Named meshes replace the last frame's; smooth shading needs new normals anyway.
             self.plotter.add_mesh(
                 pyvista.PolyData.from_regular_faces(m.positions[frame].copy(), m.faces),
                 name=f"mesh{k}",
-                color=m.colour,
                 smooth_shading=True,
                 specular=0.1,
                 reset_camera=False,
-                backface_params={"color": tuple(0.6 * c for c in m.colour)},
+                backface_params={"color": tuple(0.6 * c for c in looks[0][1])},
+                **painted,
             )
         target = np.array([centre[0], self.floor + 0.5 * self.span, centre[2]])
         eye = target + np.array([1.3, 0.5, 3.4]) * (self.span / _SPAN)

@@ -89,7 +89,8 @@ class Stage:
 
     def _mesh(self, mesh: AnimatedMesh, folder: str) -> Any:
         # Display colours are linear, a browser's aren't.
-        colour = tuple(int(255 * c ** (1 / 2.2)) for c in mesh.colour)
+        most = max(mesh.looks, key=lambda look: len(look[2]))[1]
+        colour = tuple(int(255 * c ** (1 / 2.2)) for c in most)
         if mesh.name in self.shown.distances and not folder:
             colour = (205, 205, 205)
         return self._scene.add_mesh_simple(

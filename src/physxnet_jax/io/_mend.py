@@ -1,0 +1,145 @@
+"""A garment made fit to be worn, written as a new file."""
+
+import pathlib
+from collections.abc import Callable
+
+import numpy as np
+
+from ..body import Body, load_body
+from ..errors import MeshError
+from ..garment import (
+    Template,
+    clean,
+    decimate,
+    lift_out,
+    mesh_health,
+    orient,
+    polygons_left,
+    subdivide,
+    template,
+    weld,
+)
+from ..geometry import Polygons, TriMesh, make_mesh
+from ._drape import drape
+from ._garment import NEAREST, carried, guess_template, place_on_body
+from ._inspect import Inspection, inspect_garment
+from ._like import place_like
+from ._mesh_file import read_mesh
+from ._obj import write_materials, write_obj
+
+# Lifting ends a little short of what it aims at.
+_LIFT = 1.3
+
+
+def fit_garment(
+    path: str | pathlib.Path,
+    out: str | pathlib.Path,
+    *,
+    like: Template | None = None,
+    edge_length: float | None = None,
+    coarser: float | None = None,
+    draped: bool = False,
+    body: Body | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[list[str], Inspection]:
+    """Writes a garment that can be worn: on the body, clean, oriented and out of the skin.
+
+    Args:
+        path: A file that `read_mesh` reads.
+        out: The ``.obj`` to write: metres, Y up, on the body at rest.
+        like: Turn, scale and move it onto this template's place instead of guessing its unit.
+        edge_length: Split edges longer than this [m].
+        coarser: Before that, decimate to about this edge length [m]; texture coordinates
+            are lost.
+        draped: At last let it down onto the body, by `drape`.
+        body: The body; the built-in one by default.
+        progress: Called by `drape`.
+
+    Returns:
+        What was done, a sentence each, and how the result looks.
+
+    Raises:
+        FormatError: A file that can't be read.
+        MeshError: No unit and axis puts it on the body, and ``like`` isn't given; ``out``
+            is the file itself; it falls off the body.
+        MissingDependencyError: Decimation without fast-simplification.
+    """
+    path, out = pathlib.Path(path), pathlib.Path(out)
+    if out.suffix.lower() != ".obj":
+        raise MeshError(f"{out}: garments are written as .obj.")
+    if out.resolve() == path.resolve():
+        raise MeshError(f"{out}: would overwrite the file it is made from. Name another one.")
+    body = load_body() if body is None else body
+    raw = read_mesh(path)
+    skin = body.rest_mesh()
+    done = []
+    if like is None:
+        v, unit, up = place_on_body(path, raw.vertices, body)
+        done.append(f"read as {unit}, {up} up.")
+    else:
+        v, told, _ = place_like(raw.vertices, template(like), skin)
+        done.append(told)
+    mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
+    before = mesh_health(mesh)
+    if before.coincident_vertices:
+        mesh = weld(mesh)
+        done.append(f"welded {before.coincident_vertices:,} vertices onto their neighbours.")
+    faces, vertices = int(mesh.faces.shape[0]), int(mesh.vertices.shape[0])
+    mesh = clean(mesh)
+    gone = faces - int(mesh.faces.shape[0]), vertices - int(mesh.vertices.shape[0])
+    if any(gone):
+        done.append(f"removed {gone[0]:,} faces and {gone[1]:,} vertices.")
+    turned = orient(mesh, skin)
+    count = int(np.sum(np.any(np.asarray(turned.faces) != np.asarray(mesh.faces), axis=1)))
+    if count:
+        done.append(f"turned {count:,} faces round.")
+    mesh, cut = turned, np.asarray(turned.faces)
+    drawn = None if raw.polygons is None else polygons_left(raw.polygons, v, mesh)
+    count = int(mesh.faces.shape[0])
+    if coarser is not None:
+        textured = mesh.uv is not None
+        mesh = decimate(mesh, coarser)
+        if int(mesh.faces.shape[0]) < count:
+            lost = ", without its texture coordinates" if textured else ""
+            done.append(f"decimated {count:,} faces to {mesh.faces.shape[0]:,}{lost}.")
+    count = int(mesh.faces.shape[0])
+    if edge_length is not None:
+        mesh = subdivide(mesh, edge_length)
+        if int(mesh.faces.shape[0]) > count:
+            done.append(f"split {count:,} faces into {mesh.faces.shape[0]:,}.")
+    moved, low = lift_out(
+        skin, np.asarray(mesh.vertices), np.asarray(mesh.faces), _LIFT * NEAREST, iterations=12
+    )
+    if low.any():
+        done.append(f"lifted {int(low.sum()):,} vertices out of the body or off it.")
+    if draped:
+        kind = guess_template(moved, np.asarray(mesh.faces)) if like is None else like
+        # Lifted over what it will slide down from, its edges are longer than it was made.
+        hung = carried(mesh, kind, path.name, body)
+        lain = drape(hung, start=moved, body=body, progress=progress)
+        far = np.linalg.norm(lain - moved, axis=1)
+        done.append(f"let it down: it moved by {1e3 * float(np.median(far)):.0f} mm.")
+        moved, _ = lift_out(skin, lain, np.asarray(mesh.faces), _LIFT * NEAREST, iterations=12)
+    # Whatever cut or joined triangles since knows nothing of polygons.
+    if drawn is not None and not np.array_equal(mesh.faces, cut):
+        drawn = None
+        if raw.count < len(raw.faces):
+            done.append("polygons are triangles now.")
+    _write(out, mesh.replace(vertices=moved), drawn)
+    return done, inspect_garment(out, body=body)
+
+
+def _write(out: pathlib.Path, mesh: TriMesh, drawn: Polygons | None) -> None:
+    library = None
+    if drawn is not None and drawn.materials:
+        library = out.with_suffix(".mtl").name
+        write_materials(out.with_name(library), drawn.materials)
+    write_obj(
+        out,
+        np.asarray(mesh.vertices),
+        np.asarray(mesh.faces),
+        None if mesh.uv is None else np.asarray(mesh.uv),
+        None if mesh.uv_faces is None else np.asarray(mesh.uv_faces),
+        polygons=drawn,
+        library=library,
+    )
