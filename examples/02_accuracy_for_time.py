@@ -34,7 +34,7 @@ print("way         ms a frame    mm from the simulation    an edge in a hundred 
 took = stage.warm_ms or stage.cold_ms / FRAMES
 print(f"simulation  {took:10.1f}                       0.0    {stretched(truth):25.0f} %")
 for name, way in {
-    "skinning": {"method": "lbs", "resolve": False},
+    "skinning": {"method": "lbs", "push_out": False},
     "nano": {"weights": "nano"},
     "small": {"weights": "small"},
     "small+relax": {"weights": "small+relax"},

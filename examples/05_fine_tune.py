@@ -22,7 +22,7 @@ truth = jnp.asarray(truth.garments[0].positions)
 
 # A dresser's network is folded for speed. What learns is the one that was loaded.
 known = px.load_predictor("nano")
-dresser = px.make_dresser(["bottom"], weights=known, resolve=False)
+dresser = px.make_dresser(["bottom"], weights=known, push_out=False)
 params, statistics = nnx.split_state(known.state, nnx.Param, ...)
 
 
@@ -57,6 +57,6 @@ print(f"{errors[0]:.1f} mm before, {errors[-1]:.1f} mm after {STEPS - 1} steps")
 
 state = nnx.merge_state(params, statistics)
 save_predictor("mine", dataclasses.replace(known, state=state), name="mine")
-clip = px.dress("walk", ["bottom"], weights="mine", frames=FRAMES, resolve=False)
+clip = px.dress("walk", ["bottom"], weights="mine", frames=FRAMES, push_out=False)
 off = jnp.sqrt(jnp.mean(jnp.sum((clip.garments[0].positions - truth) ** 2, axis=-1)))
 print(f"worn from the folder `mine`: {1e3 * float(off):.1f} mm off")

@@ -95,12 +95,12 @@ def main() -> None:
         for name in names
     ]
     errors = {}
-    for resolve in (False, True):
+    for push_out in (False, True):
         worn = {
-            t: dress(motion, [t], weights=words.weights, resolve=resolve, include_body=False)
+            t: dress(motion, [t], weights=words.weights, push_out=push_out, include_body=False)
             for t in TEMPLATES
         }
-        errors["network+push" if resolve else "network"] = {
+        errors["network+push" if push_out else "network"] = {
             t: rmse(clip.garments[0].positions, truth[t]) for t, clip in worn.items()
         }
     predictor = load_predictor(words.weights)

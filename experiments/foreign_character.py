@@ -49,7 +49,7 @@ def main() -> None:
     ]
     pictures = []
     for outfit in OUTFITS:
-        raw = dress(person, outfit, resolve=False)
+        raw = dress(person, outfit, push_out=False)
         clip = dress(person, outfit)
         for a, b in zip(raw.garments, clip.garments, strict=True):
             moved = np.linalg.norm(a.positions - b.positions, axis=2).max()

@@ -49,7 +49,7 @@ def main() -> None:
             began = time.perf_counter()
             person = load_character(files["mannequin"], motion=motion, frames=int(30 * SECONDS))
             spent = time.perf_counter() - began
-            raw = dress(person, outfit, resolve=False)
+            raw = dress(person, outfit, push_out=False)
             clip = dress(person, outfit)
             for g in clip.garments:
                 lines.append(

@@ -136,7 +136,7 @@ def main() -> None:
     words = parser.parse_args()
     clip = load_motion(words.motion, fps=30.0)
     motion = Motion(clip.rotations[: words.frames], clip.root[: words.frames], 30.0, clip.name)
-    dresser = make_dresser(words.wear, weights=words.weights, resolve=False)
+    dresser = make_dresser(words.wear, weights=words.weights, push_out=False)
     worn = dress(motion, words.wear, method=words.target, weights=words.weights)
     target = {g.name: jnp.asarray(g.positions) for g in worn.garments}
     true = (motion.rotations, motion.root)

@@ -68,7 +68,7 @@ def main() -> None:
                     weights=words.weights,
                     shape=figure,
                     include_body=False,
-                    resolve=m == "network",
+                    push_out=m == "network",
                 )
                 for m in ("simulate", "network", "lbs")
             }

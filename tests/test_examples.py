@@ -14,7 +14,7 @@ PAGES = [p for p in sorted(ROOT.glob("docs/*.md")) if "```python" in p.read_text
 
 
 def test_they_are_numbered_without_a_gap():
-    assert [p.name[:2] for p in EXAMPLES] == [f"{k:02d}" for k in range(6)]
+    assert [p.name[:2] for p in EXAMPLES] == [f"{k:02d}" for k in range(7)]
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
@@ -32,6 +32,9 @@ def test_an_example_runs(path, tmp_path):
     if path.name.startswith("04"):
         found = float(re.search(r"found ([\d.]+) rad", done.stdout).group(1))
         assert found == pytest.approx(0.6, abs=0.02)
+    if path.name.startswith("06"):
+        found = float(re.search(r"found ([\d.]+) times", done.stdout).group(1))
+        assert found == pytest.approx(3.0, rel=0.05)
     if path.name.startswith("05"):
         before, after, worn = (float(x) for x in re.findall(r"([\d.]+) mm", done.stdout))
         assert after < 0.7 * before and worn < 1.05 * after

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from ._environment import (
     check_jaxlib as _check_jaxlib,
+    is_command as _is_command,
     keep_programs as _keep_programs,
     keeps_programs as _keeps_programs,
 )
@@ -22,7 +23,7 @@ if _keeps_programs(_sys.argv):
     _keep_programs()
 
 # `physxnet doctor` must be able to say what is wrong.
-if _sys.argv[1:2] != ["doctor"]:
+if not (_is_command(_sys.argv) and _sys.argv[1:2] == ["doctor"]):
     _check_jaxlib()
 
 if _TYPE_CHECKING:

@@ -63,10 +63,12 @@ def keeps_programs(words: Sequence[str]) -> bool:
 
     Commands that measure compilation must compile.
     """
-    return pathlib.PurePath(words[0]).stem == "physxnet" and words[1:2] not in (
-        ["bench"],
-        ["effects"],
-    )
+    return is_command(words) and words[1:2] not in (["bench"], ["effects"])
+
+
+def is_command(words: Sequence[str]) -> bool:
+    """Whether a process of these words is the command `physxnet`."""
+    return bool(words) and pathlib.PurePath(words[0]).stem == "physxnet"
 
 
 def keep_programs(environment: MutableMapping[str, str] | None = None) -> None:

@@ -1,12 +1,13 @@
 """Writing files whole or not at all, reading archives of unknown origin."""
 
 import contextlib
+import json
 import math
 import os
 import pathlib
 import threading
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,35 @@ def whole_file(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def json_text(values: object) -> str:
+    """JSON of nested values; paths are text, and what isn't finite is null: JSON has no NaN.
+
+    Example:
+        >>> print(json_text({"file": pathlib.PurePosixPath("a.obj"), "gap": math.inf}))
+        {
+         "file": "a.obj",
+         "gap": null
+        }
+    """
+    return json.dumps(_plain(values), indent=1, allow_nan=False)
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, pathlib.PurePath) else value
+
+
+def write_json(path: str | pathlib.Path, values: object) -> None:
+    """Writes `json_text` of nested values, whole or not at all."""
+    with whole_file(path) as part:
+        part.write_text(json_text(values) + "\n", encoding="utf-8")
 
 
 def read_arrays(

@@ -4,6 +4,7 @@ Axis names are fixed: ``batch frames vertices faces joints height width channels
 (and ``texels``, the covered pixels of an atlas, in row-major order).
 """
 
+import dataclasses
 from typing import TypeAlias, TypeVar
 
 import jax
@@ -38,13 +39,19 @@ def pytree(cls: _Class) -> _Class:
     markers. Their fields' annotations tell the shape of one instance and aren't checked.
 
     Args:
-        cls: A frozen dataclass; fields with metadata ``static=True`` aren't leaves.
+        cls: A frozen dataclass; fields with metadata ``static=True`` aren't leaves. Those
+            with ``told=True`` aren't part of the pytree at all: they are for people, and
+            have their default again in whatever JAX rebuilds.
 
     Returns:
         The class.
     """
     cls.__no_type_check__ = True  # pyright: ignore[reportAttributeAccessIssue]
-    return jax.tree_util.register_dataclass(cls)
+    told = [f.name for f in dataclasses.fields(cls) if f.metadata.get("told", False)]  # pyright: ignore[reportArgumentType]
+    kept = [f for f in dataclasses.fields(cls) if f.name not in told]  # pyright: ignore[reportArgumentType]
+    static = [f.name for f in kept if f.metadata.get("static", False)]
+    leaves = [f.name for f in kept if f.name not in static]
+    return jax.tree_util.register_dataclass(cls, leaves, static, told)
 
 
 __all__ = [

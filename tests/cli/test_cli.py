@@ -190,7 +190,7 @@ def test_skeleton_and_rate_reach_the_reader(command, tmp_path, monkeypatch):
         raise MotionError("enough")
 
     monkeypatch.setattr("physxnet_jax.motion.load_motion", read)
-    monkeypatch.setattr("physxnet_jax.dressing._scene_file.load_motion", read)
+    monkeypatch.setattr("physxnet_jax.dressing._wanted_clip.load_motion", read)
     monkeypatch.setattr("physxnet_jax.viewer._job.load_motion", read)
     words = ["--skeleton", "b.asf", "--source-fps", "60"]
     words += ["--html", str(tmp_path / "a.html")] if command == "view" else []

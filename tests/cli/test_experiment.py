@@ -8,6 +8,7 @@ import pytest
 from physxnet_jax.cli import main
 from physxnet_jax.data import list_sequences, read_log
 from physxnet_jax.dressing import EXPORTED
+from physxnet_jax.motion import load_motion, save_motion
 
 DATASET = """
 from physxnet_jax.data import DatasetConfig
@@ -26,8 +27,12 @@ CONFIG = TrainConfig(
 """
 
 
-def test_build_train_evaluate(data_dir, tmp_path, capsys):
-    mocap = str(data_dir / "mocap")
+def test_build_train_evaluate(tmp_path, capsys):
+    mocap = str(tmp_path / "mocap")
+    save_motion(tmp_path / "mocap/a.npz", load_motion("punch", fps=30))
+    (tmp_path / "mocap/ACTIONS.csv").write_text(
+        "split,action,file,start_s,frames_at_30fps\ntrain,run,a.npz,0.0,34\ntest,on,a.npz,2,30\n"
+    )
     for name, text in (("dataset.py", DATASET), ("tiny.py", TRAIN)):
         (tmp_path / name).write_text(text)
     root, run, out = (str(tmp_path / n) for n in ("set", "run", "errors.json"))
@@ -65,6 +70,21 @@ def test_build_train_evaluate(data_dir, tmp_path, capsys):
     again = json.loads((tmp_path / "errors.json").read_text())
     assert [r.pop("ms_per_frame") > 0 for r in again] == [True] * len(rows)
     assert again == [{k: v for k, v in r.items() if k != "ms_per_frame"} for r in rows]
+    # Rows of another network, or of another simulation, aren't taken for this one's.
+    card_file = tmp_path / "run/weights/card.json"
+    text = card_file.read_text()
+    card_file.write_text(text.replace(json.loads(text)["sha256"], 64 * "0"))
+    assert main([*measure, "--quiet"]) == 2
+    assert "another network of that name" in capsys.readouterr().err
+    card_file.write_text(text)
+    changed = [r | {"data": 16 * "0"} for r in json.loads((tmp_path / "errors.json").read_text())]
+    (tmp_path / "old.json").write_text(json.dumps(changed))
+    assert main([*measure[:-1], str(tmp_path / "old.json"), "--quiet"]) == 2
+    assert "another simulation" in capsys.readouterr().err
+    for broken in ("{", "[1]", '[{"method": "lbs"}]'):
+        (tmp_path / "old.json").write_text(broken)
+        assert main([*measure[:-1], str(tmp_path / "old.json"), "--quiet"]) == 2
+        assert "not rows that this command can go on from" in capsys.readouterr().err
     # Whose rows are all there needn't be.
     shutil.rmtree(run)
     assert main([*measure, "--quiet"]) == 0

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import pathlib
 import subprocess
 import sys
 
@@ -9,17 +10,18 @@ import numpy as np
 import pytest
 
 from physxnet_jax.cli import main
+from physxnet_jax.cli._progress import print_json
 from physxnet_jax.dressing import load_scene, make_dresser, make_scene
 from physxnet_jax.errors import (
-    FormatError,
     MissingDependencyError,
     MotionError,
+    PhysXNetError,
     SimulationError,
 )
 from physxnet_jax.evaluation import price_effects, recommend_effects
 from physxnet_jax.garment import square_sheet, template
 from physxnet_jax.io import write_obj
-from physxnet_jax.motion import load_motion
+from physxnet_jax.motion import body_animation, load_motion
 from physxnet_jax.simulation import (
     XPBD,
     Air,
@@ -27,6 +29,7 @@ from physxnet_jax.simulation import (
     Gravity,
     LayerContact,
     Pin,
+    Rollout,
     Scene,
     Stretch,
     prepare_scene,
@@ -153,6 +156,12 @@ def test_a_motion_is_simulated_at_the_rate_that_is_asked_for():
         ('motion = "walk"\n[also.air]\nstorm = 1', "air has no 'storm'"),
         ('motion = "walk"\n[also.stretch]\ncompression = 0', "stretch: compression is 0"),
         ('motion = "walk"\n[also.membrane]\ncompression = -1', "membrane: compression is -1"),
+        (
+            'motion = "walk"\n[also.body_contact]\nhops = 2.5',
+            "hops is 2.5, expected a whole number",
+        ),
+        ('motion = "walk"\n[also.body_contact]\nhops = true', "hops is True, expected a whole"),
+        ('motion = "walk"\n[shape]\nself = 1', "Unknown shape parameter"),
         ('motion = "walk"\naccuracy = "best"', "draft, standard, fine"),
         ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = "tin"', "cotton"),
         ('motion = "walk"\n[[garments]]\nname = "top"', "file and fabric"),
@@ -161,7 +170,7 @@ def test_a_motion_is_simulated_at_the_rate_that_is_asked_for():
 def test_wrong_scene_files_are_refused_with_a_fix(tmp_path, text, says):
     path = tmp_path / "scene.toml"
     path.write_text(text)
-    with pytest.raises(FormatError, match=says):
+    with pytest.raises(PhysXNetError, match=says):
         load_scene(path)
 
 
@@ -270,3 +279,32 @@ def test_a_rollout_has_one_name_in_every_process():
     assert len(first) == 64 and name(100_000) == first
     # The control: another setting is another rollout.
     assert name(0, steps=16) != first
+
+
+def test_a_loaded_motion_stands_on_the_floor_whatever_the_shape(body):
+    clip = load_motion("walk", fps=30)
+    tall = body.shape(height_up=1.0)
+    low = []
+    for motion in (clip, "walk"):
+        job = make_scene(motion, ["top"], shape=tall, frames=4)
+        person = body_animation(body, job.motion, tall)
+        low.append(float(np.asarray(person)[..., 1].min()))
+    assert low[0] == pytest.approx(low[1], abs=0.01) and abs(low[0]) < 0.03
+    sunk = body_animation(body, clip, tall)
+    assert float(np.asarray(sunk)[..., 1].min()) < -0.05, "the control: as it was loaded"
+
+
+@pytest.mark.parametrize("word", ["source_fps", "skeleton", "joint_map"])
+def test_what_is_for_files_is_refused_for_a_loaded_motion(word):
+    value = 60.0 if word == "source_fps" else "a.asf"
+    with pytest.raises(MotionError, match=f"{word} is for motion files"):
+        make_scene(load_motion("walk", fps=30), ["top"], **{word: value})
+
+
+def test_what_machines_read_is_json_whatever_was_measured(capsys):
+    print_json({"gap": np.inf, "x": [1.0, float("nan")], "path": pathlib.Path("a")})
+    told = json.loads(capsys.readouterr().out, parse_constant=lambda c: pytest.fail(c))
+    assert told == {"gap": None, "x": [1.0, None], "path": "a"}
+    gaps = np.array([0.5, 0.1, 0.2])
+    rollout = Rollout((), 30.0, {"finite": np.ones(3), "self_gap": gaps, "strain_max": gaps})
+    assert rollout.worst == {"self_gap": 0.1, "strain_max": 0.5}

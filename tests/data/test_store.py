@@ -11,7 +11,9 @@ from hypothesis import given, settings, strategies as st
 
 from physxnet_jax.body import load_body
 from physxnet_jax.data import (
+    Action,
     DatasetConfig,
+    _build,
     build_dataset,
     dataset_digest,
     expected_frames,
@@ -29,10 +31,10 @@ from physxnet_jax.data import (
 from physxnet_jax.data._build import action_motion
 from physxnet_jax.errors import FormatError, MotionError
 from physxnet_jax.evaluation import skinning
-from physxnet_jax.garment import square_sheet
+from physxnet_jax.garment import square_sheet, template
 from physxnet_jax.motion import load_motion, make_motion, save_motion
-from physxnet_jax.simulation import XPBD
-from physxnet_jax.training import teaches
+from physxnet_jax.simulation import XPBD, Rollout, Scene, prepare_scene
+from physxnet_jax.training import teaches, usable_garment
 
 
 def stored(root, frames=70, seed=0):
@@ -280,3 +282,65 @@ def test_a_row_that_is_none_is_named(tmp_path, row):
 def test_a_missing_protocol_is_named(tmp_path):
     with pytest.raises(MotionError, match=r"ACTIONS\.csv"):
         read_protocol(tmp_path)
+
+
+def test_what_is_damaged_is_named_and_so_is_what_does_not_belong(tmp_path):
+    folder, offsets = stored(tmp_path)
+    write_offsets(folder, "top", offsets, {})
+    motion = load_motion("walk")
+    with pytest.raises(FormatError, match="its motion isn't the one"):
+        write_action(folder, dataclasses.replace(motion, fps=60.0), "train")
+    with pytest.raises(FormatError, match="stored as 'train', now 'test'"):
+        write_action(folder, motion, "test")
+    write_action(folder, motion, "train")
+    sheet = square_sheet(9)
+    vertices, faces = np.asarray(sheet.mesh.vertices), np.asarray(sheet.mesh.faces)
+    write_garment(tmp_path, "top", vertices, faces)
+    with pytest.raises(FormatError, match="another garment"):
+        write_garment(tmp_path, "top", 1.1 * vertices, faces)
+    with pytest.raises(FormatError, match="32,767"):
+        write_garment(tmp_path, "big", np.zeros((40_000, 3), np.float32), faces)
+    note = folder / "top" / "zarr.json"
+    text = note.read_text()
+    for broken in (text[: len(text) // 2], "{}", "[]"):
+        note.write_text(broken)
+        with pytest.raises(FormatError, match=r"damaged .* build the dataset again"):
+            read_sequence(folder)
+    note.write_text(text)
+    chunk = next(p for p in (folder / "top").rglob("*") if p.is_file() and p.name != "zarr.json")
+    whole = chunk.read_bytes()
+    chunk.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(FormatError, match="damaged"):
+        read_sequence(folder)
+    chunk.write_bytes(whole)
+    (folder / "action.json").write_text("{")
+    with pytest.raises(FormatError, match="damaged"):
+        list_sequences(tmp_path, "train")
+
+
+def test_an_action_ends_with_its_clip(tmp_path):
+    save_motion(tmp_path / "a.npz", load_motion("walk", fps=30))  # four seconds
+    action = Action("train", "walk", "a.npz", 2.0, 60, None)
+    assert load_action(tmp_path, action).num_frames == 60
+    for wrong in ({"frames": 61}, {"start": 2.1}, {"start": -0.1}, {"start": float("nan")}):
+        with pytest.raises(MotionError, match=r"a\.npz: walk goes from .* Correct the table"):
+            load_action(tmp_path, dataclasses.replace(action, **wrong))
+
+
+def test_one_explosion_does_not_stop_a_build(tmp_path, monkeypatch):
+    sheet = template("top")
+    motion = load_motion("walk", fps=30)
+    clip = dataclasses.replace(motion, rotations=motion.rotations[:3], root=motion.root[:3])
+    monkeypatch.setattr(_build, "action_motion", lambda *a: clip)
+    lost = np.full((3, sheet.num_vertices, 3), np.nan, np.float32)
+    told = {"finite": np.zeros(3), "speed_max": np.full(3, np.nan), "self_gap": np.full(3, np.inf)}
+    rollout = Rollout((lost,), 30.0, told | {"strain_max": np.array([0.1, 0.2, 0.3])})
+    monkeypatch.setattr(_build, "simulate_batch", lambda *a, **k: [rollout])
+    scene = prepare_scene(Scene((sheet,)))
+    write_garment(tmp_path, "top", np.asarray(sheet.mesh.vertices), np.asarray(sheet.mesh.faces))
+    action = Action("train", "walk", "a.npz", 0.0, 3, None)
+    config = DatasetConfig(templates=("top",))
+    _build._simulate(config, tmp_path / "walk", "top", action, scene, tmp_path, None)
+    meta = read_sequence(tmp_path / "walk").meta["top"]
+    assert not meta["finite"] and not usable_garment(meta)
+    assert meta["worst"] == {"strain_max": pytest.approx(0.3)}

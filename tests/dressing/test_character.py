@@ -129,7 +129,7 @@ def test_cloth_goes_along_with_what_no_joint_moves(character):
     )
     swell = np.zeros_like(character.leftover)
     swell[-1] = 0.03 * belly[:, None] * [0.0, 0.0, 1.0]
-    plain = {"method": "lbs", "resolve": False}
+    plain = {"method": "lbs", "push_out": False}
     flat = dress(character, ["top"], **plain).garments[0].positions
     grown = dataclasses.replace(character, leftover=character.leftover + swell)
     out = dress(grown, ["top"], **plain).garments[0].positions - flat
@@ -154,7 +154,7 @@ def test_cloth_is_moved_out_of_the_skin_that_is_seen(character):
     g = on_character(template("bottom"), character)
     w = unbound_wearable(body, rest, g)
     patch = make_patch(body, rest, w, g.mesh)
-    tight = dress(character, ["bottom"], method="lbs", resolve=False).garments[0].positions
+    tight = dress(character, ["bottom"], method="lbs", push_out=False).garments[0].positions
     before = inside_character(fat, tight)
     out = clear_of_character(patch, w, fat, tight, world, shift)
     assert before > 0.05 and inside_character(fat, out) < 0.2 * before

@@ -16,7 +16,7 @@ from physxnet_jax.motion import animate, load_motion
 
 def test_lbs_is_linear_blend_skinning(body, rest):
     motion = load_motion("punch", fps=30.0)
-    clip = dress("punch", ["top"], method="lbs", frames=18, resolve=False)
+    clip = dress("punch", ["top"], method="lbs", frames=18, push_out=False)
     g = template("top")
     expected = animate(body, rest, g.rest_vertices(rest), g.skin, motion)
     np.testing.assert_allclose(clip.garments[0].positions, np.asarray(expected)[:18], atol=1e-5)
@@ -44,7 +44,7 @@ def test_another_clip_of_another_length_compiles_nothing():
     programs = dress_block._cache_size()
     dress("punch", ["bottom"], method="lbs", frames=40)
     assert dress_block._cache_size() == programs
-    dress("walk", ["bottom"], method="lbs", frames=3, resolve=False)
+    dress("walk", ["bottom"], method="lbs", frames=3, push_out=False)
     assert dress_block._cache_size() == programs + 1, "another program is one more"
 
 
@@ -52,7 +52,7 @@ def test_the_simulation_is_what_its_own_rollout_says():
     clip = dress("balance", ["bottom"], method="simulate", frames=4)
     assert np.isfinite(clip.garments[0].positions).all()
     waist = np.asarray(template("bottom").pinned)
-    lbs = dress("balance", ["bottom"], method="lbs", frames=4, resolve=False)
+    lbs = dress("balance", ["bottom"], method="lbs", frames=4, push_out=False)
     gap = clip.garments[0].positions[:, waist] - lbs.garments[0].positions[:, waist]
     assert np.abs(gap).max() < 1e-4
 
@@ -87,6 +87,6 @@ def test_what_evaluation_measures_is_what_dress_gives(push):
     method = pushed_network(predictor) if push else network(predictor)
     motion = load_motion("punch", fps=30.0)
     short = dataclasses.replace(motion, rotations=motion.rotations[:20], root=motion.root[:20])
-    clip = dress(short, ["top"], include_body=False, resolve=push)
+    clip = dress(short, ["top"], include_body=False, push_out=push)
     measured = method(short, "top").positions
     np.testing.assert_allclose(measured, clip.garments[0].positions, atol=2e-5)

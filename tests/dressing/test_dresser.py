@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 
@@ -22,7 +23,7 @@ from physxnet_jax.dressing import (
 from physxnet_jax.dressing._dresser import _check_pose
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.io import load_predictor
-from physxnet_jax.models import PAPER
+from physxnet_jax.models import PAPER, fold_batch_norm
 
 
 @pytest.fixture(scope="module")
@@ -66,9 +67,9 @@ def shapes(dresser):
 
 def test_clothes_follow_the_shape_as_if_made_for_it(dresser, shapes, motion):
     """Without push-out exactly; with it up to which skin is compared."""
-    for resolve, near in ((False, 1e-5), (True, 2e-3)):
-        mine = dataclasses.replace(dresser, resolve=resolve)
-        made = make_dresser(["bottom"], shape=shapes[0], resolve=resolve)
+    for push_out, near in ((False, 1e-5), (True, 2e-3)):
+        mine = dataclasses.replace(dresser, push_out=push_out)
+        made = make_dresser(["bottom"], shape=shapes[0], push_out=push_out)
         run = jax.jit(lambda d: clothe(d, *motion, 30.0)["bottom"])
         moved, wanted, before = run(with_shape(mine, shapes[0])), run(made), run(mine)
         assert float(jnp.abs(moved - wanted).max()) < near
@@ -80,7 +81,7 @@ def test_shapes_are_batched_and_differentiated(dresser, shapes, motion):
 
     @jax.jit
     def cloth(shape):
-        person = with_shape(dataclasses.replace(dresser, resolve=False), shape)
+        person = with_shape(dataclasses.replace(dresser, push_out=False), shape)
         return clothe(person, *motion, 30.0)["bottom"]
 
     crowd = jax.jit(jax.vmap(cloth))(shapes)
@@ -159,7 +160,7 @@ def test_an_export_runs_without_this_package(dresser, whole, motion, tmp_path):
 def test_templates_are_bound_where_they_lie_on_a_body_of_other_proportions(body):
     large = dataclasses.replace(body, bases=1.15 * body.bases, deltas=1.15 * body.deltas)
     ours, theirs = (
-        make_dresser(["bottom"], body=b, weights="nano", resolve=False) for b in (body, large)
+        make_dresser(["bottom"], body=b, weights="nano", push_out=False) for b in (body, large)
     )
     tied = theirs.wearables[0].binding
     assert tied.hit_rate > 0.95 and tied.fallbacks <= ours.wearables[0].binding.fallbacks + 30
@@ -231,3 +232,62 @@ def test_weights_are_loaded_inside_a_traced_function_too(motion):
 
     want = float(jax.tree.leaves(load_predictor("nano").state)[0].sum())
     assert float(total(jnp.ones(()))) == pytest.approx(want, rel=1e-5)
+
+
+def test_a_predictor_of_another_person_dresses_this_one(dresser, shapes, motion):
+    """Its texels are put onto the body that is asked for, whatever body they were on."""
+    heavy = make_dresser(["bottom"], shape=shapes[0])
+    again = make_dresser(["bottom"], weights=heavy.predictor)
+    usual = make_dresser(["bottom"], weights=fold_batch_norm(load_predictor()))
+    a, b = (clothe(d, *(x[:3] for x in motion), 30.0) for d in (again, usual))
+    np.testing.assert_allclose(a["bottom"], b["bottom"], atol=1e-6)
+    other = clothe(heavy, *(x[:3] for x in motion), 30.0)
+    assert np.abs(np.asarray(other["bottom"] - a["bottom"])).max() > 5e-3
+
+
+def test_what_is_told_of_files_is_no_part_of_the_program(dresser):
+    told = dataclasses.replace(dresser, notes=("a",))
+    other = dataclasses.replace(dresser, notes=("b",))
+    traced = []
+
+    @jax.jit
+    def same(d):
+        traced.append(1)
+        return d
+
+    assert same(told).notes == same(other).notes == () and len(traced) == 1
+    assert told.notes == ("a",) and jax.tree.structure(told) == jax.tree.structure(other)
+
+
+def test_people_are_spread_over_devices_by_shard_map(tmp_path):
+    """In a process of two devices: one person on each is what one process says of both."""
+    code = """
+import jax, jax.numpy as jnp, numpy as np
+from jax.sharding import Mesh, PartitionSpec as P
+import physxnet_jax as px
+dresser = px.make_dresser(["bottom"], weights="nano")
+motion = px.load_motion("walk", fps=30)
+q = jnp.stack([motion.rotations[:2], motion.rotations[2:4]])
+p = jnp.stack([motion.root[:2], motion.root[2:4]])
+mesh = Mesh(np.array(jax.devices()), ("people",))
+move = jax.vmap(jax.vmap(lambda a, b: dresser.body.transforms(dresser.rest, a, b)[1]))
+wear = jax.vmap(lambda a, b: px.clothe(dresser, a, b, 30.0)["bottom"])
+each, all_alike = P("people"), P()
+for f, specs in ((move, (each, all_alike)), (move, (all_alike, each)), (wear, (each, each))):
+    args = [x if s == each else x[:1] for x, s in zip((q, p), specs)]
+    wide = [jnp.concatenate([x, x]) if len(x) == 1 else x for x in args]
+    spread = jax.jit(jax.shard_map(f, mesh=mesh, in_specs=specs, out_specs=each))
+    gap = jnp.abs(spread(*args) - jax.jit(f)(*wide)).max()
+    assert gap < 1e-5, (specs, gap)
+print(len(jax.devices()), "devices")
+"""
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"XLA_FLAGS": flags.strip(), "JAX_PLATFORMS": "cpu"},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0 and "2 devices" in done.stdout, done.stderr[-2000:]

@@ -21,7 +21,7 @@ FAR = 0.8
 @pytest.fixture(scope="module")
 def dresser():
     # The push-out has hard cases of its own.
-    return make_dresser(["bottom", "dress"], resolve=False)
+    return make_dresser(["bottom", "dress"], push_out=False)
 
 
 @pytest.fixture(scope="module")

@@ -78,7 +78,7 @@ def test_the_card_is_that_of_the_weights():
     both = load_predictor("nano+relax+mirror")
     assert both.mirrored and both.relaxation and not load_predictor("nano").relaxation
     options = Rung("nano+mirror+relax+push", {}, {}).options
-    assert options == {"method": "network", "weights": "nano+mirror+relax", "resolve": True}
+    assert options == {"method": "network", "weights": "nano+mirror+relax", "push_out": True}
     names = ("nano", "nano+mirror", "nano+relax", "nano+mirror+push")
     assert len({Rung(n, {}, {}).identity for n in names}) == len(names)
     with pytest.raises(ValueError, match="0 steps or more"):

@@ -14,7 +14,7 @@ MADE = runpy.run_path(str(pathlib.Path(__file__).parents[2] / "experiments/recov
 
 
 def test_a_turned_pose_is_found_from_its_clothes():
-    dresser = make_dresser(["bottom"], resolve=False)
+    dresser = make_dresser(["bottom"], push_out=False)
     walk = load_motion("walk", fps=30.0)
     true = walk.rotations[10:12], walk.root[10:12]
     layer = MADE["skinning_layer"](dresser)

@@ -105,7 +105,7 @@ def test_a_clip_of_one_frame_is_the_first_of_a_longer_one(dresser, motion):
 @pytest.mark.parametrize("weights", ["nano", "small", "local+relax", "pair+mirror"])
 def test_the_slope_by_the_pose_is_the_differences_at_every_rung(dresser, motion, weights):
     """And by the weights. The mean height of a leg that is bent, without push-out's corners."""
-    person = make_dresser(["bottom"], weights=weights, resolve=False)
+    person = make_dresser(["bottom"], weights=weights, push_out=False)
     rotations, root = (x[:2] for x in motion)
     knee = dresser.body.joint("LeftLeg")
     rng = np.random.default_rng(0)
@@ -144,7 +144,7 @@ def test_bfloat16_adds_less_than_two_percent_to_the_error(dresser, motion):
     clothed = [
         np.asarray(jax.jit(clothe, static_argnames="fps")(d, *motion, fps=30.0)["bottom"])
         for d in (
-            make_dresser(["bottom"], resolve=False, precision=p) for p in ("float32", "bfloat16")
+            make_dresser(["bottom"], push_out=False, precision=p) for p in ("float32", "bfloat16")
         )
     ]
     apart = np.sqrt(np.mean(np.sum((clothed[0] - clothed[1]) ** 2, axis=2)))

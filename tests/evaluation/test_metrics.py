@@ -13,8 +13,10 @@ def test_a_known_shift_has_a_known_error():
     assert e.rmse_mm == pytest.approx(5.0, rel=1e-3) and e.mse_mm2 == pytest.approx(25.0, rel=1e-3)
     assert e.mean_mm == pytest.approx(5.0, rel=1e-3) and e.max_mm == pytest.approx(5.0, rel=1e-3)
     half = x.copy()
-    half[..., :3, 0] += 0.0
-    assert vertex_error(half, x).max_mm == 0.0
+    half[..., :3, 0] += 0.002
+    e = vertex_error(half, x)
+    assert e.mse_mm2 == pytest.approx(4.0 * 3 / 7, rel=1e-3), "three of seven vertices"
+    assert e.max_mm == pytest.approx(2.0, rel=1e-3) and vertex_error(x, x).max_mm == 0.0
     # The shape check of the test suite comes first; outside it the ValueError speaks.
     with pytest.raises((ValueError, jaxtyping.TypeCheckError)):
         vertex_error(x[:, :2], x)

@@ -1,5 +1,6 @@
 """People from other programs: every format says the same, in any unit and axes."""
 
+import dataclasses
 import json
 import pathlib
 import runpy
@@ -12,7 +13,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from physxnet_jax.errors import FormatError, PhysXNetError
-from physxnet_jax.io import AnimatedMesh, read_character, write_clip, write_obj, write_pc2
+from physxnet_jax.io import AnimatedMesh, read_character, read_pc2, write_clip, write_obj, write_pc2
+from physxnet_jax.io._moving import Moving, welded
 from physxnet_jax.motion import body_animation, procedural_clip
 
 _SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
@@ -376,3 +378,45 @@ def test_broken_files_are_refused_in_a_sentence(clip, tmp_path):
     (tmp_path / "i.glb").write_bytes(head + blob)
     with pytest.raises(PhysXNetError, match="no mesh that moves"):
         read_character(tmp_path / "i.glb")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"fps": 0.0},
+        {"fps": -5.0},
+        {"fps": float("nan")},
+        {"source_fps": 0.0},
+        {"source_fps": -3.0},
+        {"frames": 0},
+        {"frames": -1},
+    ],
+)
+def test_rates_and_counts_that_are_none_are_refused(clip, tmp_path, wrong):
+    np.savez(tmp_path / "me.npz", positions=clip, faces=FACES, fps=30.0)
+    with pytest.raises(FormatError, match=f"^{next(iter(wrong))} is .*(expected|ask for)"):
+        read_character(tmp_path / "me.npz", **wrong)
+
+
+def test_what_touches_in_some_frames_is_no_seam():
+    """Hands clap at the start and the end; a seam's doubles stay together all the time."""
+    x = np.array(
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0], [1, 0, 0], [0, 0, 1], [1, 0, 0]], float
+    )
+    clip = np.stack([x, x, x]).astype(np.float32)
+    clip[1, 3:] += 0.5
+    part = Moving("hands", clip, np.array([[0, 1, 2], [3, 4, 5], [3, 6, 5]], np.int32))
+    one = welded(part)
+    assert one.positions.shape[1] == 6, "4 and 6 are one; 3 and 4 aren't 0 and 1"
+    np.testing.assert_array_equal(one.positions[:, one.faces], clip[:, part.faces])
+    still = welded(dataclasses.replace(part, positions=clip[:1]))
+    assert still.positions.shape[1] == 4, "the control: in one frame they are"
+
+
+def test_caches_have_a_sample_for_each_frame(clip, tmp_path):
+    write_pc2(tmp_path / "a.pc2", clip)
+    blob = bytearray((tmp_path / "a.pc2").read_bytes())
+    struct.pack_into("<f", blob, 24, 2.0)
+    (tmp_path / "a.pc2").write_bytes(blob)
+    with pytest.raises(FormatError, match="every 2 frames"):
+        read_pc2(tmp_path / "a.pc2")

@@ -1,11 +1,14 @@
 """Writers read back by independent readers; broken files refused in a sentence."""
 
 import dataclasses
+import hashlib
 import json
 
+import jax
 import numpy as np
 import pytest
 import trimesh
+from safetensors.numpy import load, save
 
 from physxnet_jax.errors import FormatError, MeshError, WeightsError
 from physxnet_jax.garment import template
@@ -242,8 +245,6 @@ def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
             save_predictor(tmp_path / "w", other, name="copy")
     save_predictor(tmp_path / "w", predictor, name="copy")
     again = load_predictor(tmp_path / "w")
-    import jax
-
     for a, b in zip(jax.tree.leaves(predictor.state), jax.tree.leaves(again.state)):
         np.testing.assert_array_equal(np.asarray(a), np.asarray(b))
     blob = bytearray((tmp_path / "w/weights.safetensors").read_bytes())
@@ -251,9 +252,20 @@ def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
     (tmp_path / "w/weights.safetensors").write_bytes(bytes(blob))
     with pytest.raises(WeightsError, match="damaged"):
         load_predictor(tmp_path / "w")
+    # A parameter of another name isn't taken for the one that is in its place.
+    tensors = load(bytes(blob))
+    name = "encoder.2.norm.mean"
+    tensors["encoder.2.norm.average"] = tensors.pop(name)
+    renamed = save(tensors)
+    (tmp_path / "w/weights.safetensors").write_bytes(renamed)
+    text = (tmp_path / "w/card.json").read_text()
+    card = json.loads(text) | {"sha256": hashlib.sha256(renamed).hexdigest()}
+    (tmp_path / "w/card.json").write_text(json.dumps(card))
+    with pytest.raises(WeightsError, match=f"{name} isn't there"):
+        load_predictor(tmp_path / "w")
+    (tmp_path / "w/weights.safetensors").write_bytes(bytes(blob))
+    (tmp_path / "w/card.json").write_text(text)
     card = json.loads((tmp_path / "w/card.json").read_text())
-    import hashlib
-
     card |= {"sha256": hashlib.sha256(bytes(blob)).hexdigest(), "atlas": "0" * 16}
     (tmp_path / "w/card.json").write_text(json.dumps(card))
     with pytest.raises(WeightsError, match="atlas"):

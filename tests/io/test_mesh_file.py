@@ -129,8 +129,8 @@ def SkelRoot "person"
     mesh = read_mesh(tmp_path / "a.usda")
     wanted = np.array([[0, 0, 5], [10, 0, 5], [10, 0, 15], [0, 0, 15], [20, 0, 5]]) * 0.01
     np.testing.assert_allclose(mesh.vertices, wanted, atol=1e-6)
-    np.testing.assert_array_equal(mesh.faces, [[1, 4, 2], [0, 1, 2], [0, 2, 3]])
-    np.testing.assert_array_equal(mesh.uv[mesh.uv_faces][..., 0], [[1, 0, 1], [0, 1, 1], [0, 1, 0]])
+    np.testing.assert_array_equal(mesh.faces, [[0, 1, 2], [0, 2, 3], [1, 4, 2]])
+    np.testing.assert_array_equal(mesh.uv[mesh.uv_faces][..., 0], [[0, 1, 1], [0, 1, 0], [1, 0, 1]])
 
 
 def test_what_is_no_garment_is_refused(trousers, tmp_path):

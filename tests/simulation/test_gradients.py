@@ -14,12 +14,16 @@ from physxnet_jax.simulation import (
     Bend,
     BodyContact,
     Gravity,
+    Implicit,
+    Membrane,
     Pin,
     Scene,
     State,
     Stretch,
+    Verlet,
     advance,
     prepare_scene,
+    start_state,
 )
 
 FPS = 30.0
@@ -85,6 +89,34 @@ def test_the_kerchief_touches(draped):
 def test_other_parameters_are_refused(draped):
     with pytest.raises(SimulationError, match="bend, friction, stretch"):
         draped.system(STEPS).rescaled(colour=1.0)
+    sheet = square_sheet(3, 0.2)
+    for effects, name in (((Gravity(), Bend()), "stretch"), ((Gravity(), Stretch()), "friction")):
+        system = prepare_scene(Scene((sheet,), effects)).system(STEPS)
+        with pytest.raises(SimulationError, match=f"No effect of this scene has {name}"):
+            system.rescaled(**{name: 2.0})
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [XPBD(8, 2), Implicit(8, 2), Implicit(8, 2, order=1), Verlet(256, 2, precision="float32")],
+)
+@pytest.mark.parametrize("elastic", [(Stretch(), Bend()), (Membrane(), Bend())])
+def test_a_rescaled_scene_is_the_scene_made_of_that_cloth(solver, elastic, body, rest):
+    """Forces, and what a solver keeps of stiffnesses, change together."""
+    pose = jnp.repeat(body.a_pose()[None, None], 5, axis=0)
+    root = jnp.repeat(body.joint_positions(rest)[0][:1][None], 5, axis=0)
+
+    def roll(fabric, **factors):
+        g = square_sheet(6, 0.2, pinned=np.arange(6), fabric=fabric)
+        scene = prepare_scene(Scene((g,), (Gravity(), *elastic, Pin())))
+        system = scene.system(solver).rescaled(**factors)
+        x = jnp.asarray(g.mesh.vertices)[:, :, None]
+        state = start_state(system, x, solver=solver, fps=FPS)
+        return np.asarray(advance(system, state, pose, root, solver=solver, fps=FPS)[1])
+
+    soft, stiff = Fabric(stretch=200.0, bend=2e-5), Fabric(stretch=400.0, bend=2e-3)
+    plain, made, told = roll(soft), roll(stiff), roll(soft, bend=100.0, stretch=2.0)
+    assert np.abs(made - told).max() < 2e-5 and np.abs(made - plain).max() > 2e-3
 
 
 def test_a_bending_stiffness_is_recovered_from_motion(body, rest):

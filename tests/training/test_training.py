@@ -108,6 +108,16 @@ def test_twenty_steps_are_ten_and_ten_bitwise(tmp_path):
     assert log[-1]["step"] == 20 and log[-1]["skipped"] == 0
     with pytest.raises(PhysXNetError, match="learning_rate"):
         train(dataclasses.replace(config, learning_rate=1.0), data, tmp_path / "whole", steps=30)
+    # A run that an earlier version began goes on: what it doesn't say is as by default.
+    path = tmp_path / "whole" / "config.json"
+    text = path.read_text()
+    told = json.loads(text)
+    assert told.pop("edge_share") == 0.0 and told["model"]["inputs"].pop("stride") == 1
+    path.write_text(json.dumps(told))
+    train(config, data, tmp_path / "whole", steps=20)
+    path.write_text(json.dumps(told | {"seed": 5}))
+    with pytest.raises(PhysXNetError, match="another seed"):
+        train(config, data, tmp_path / "whole", steps=20)
 
 
 def test_a_short_run_learns_and_both_players_stay_in_their_band(tmp_path):

@@ -134,7 +134,7 @@ class Body:
         """All zeros: the young woman that garments are modelled on."""
         return jnp.zeros((len(self.shape_names),), jnp.float32)
 
-    def shape(self, **values: float | int) -> Float[Array, " shapes"]:
+    def shape(self, /, **values: float | int) -> Float[Array, " shapes"]:
         """Shape parameters by name.
 
         Raises:
@@ -153,7 +153,9 @@ class Body:
             )
         for name, value in values.items():
             if not -1.0 <= value <= 2.0:
-                raise PhysXNetError(f"{name}={value}: expected a number from 0 to 1.")
+                raise PhysXNetError(
+                    f"{name}={value}: expected a number from 0 to 1, at most from -1 to 2."
+                )
         return jnp.asarray([float(values.get(name, 0.0)) for name in self.shape_names], jnp.float32)
 
     def a_pose(self) -> Float[Array, "joints 4"]:

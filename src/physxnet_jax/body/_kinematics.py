@@ -43,8 +43,9 @@ def forward_kinematics(
     local = matrix_from_quaternion(pose)
     one = jnp.eye(3, dtype=local.dtype)[None]
     local = jnp.concatenate([local, one])
-    world = jnp.repeat(one, joints + 1, axis=0)
-    place = jnp.repeat(root[None], joints + 1, axis=0)
+    # All but the last row are overwritten; what a scan carries has to vary over a mesh of
+    # devices (`jax.shard_map`) from its start as it does at its end.
+    world, place = local, root[None] + 0.0 * local[:, 0]
 
     def descend(
         state: tuple[Array, Array], rows: tuple[Array, Array]

@@ -1,7 +1,6 @@
 """`physxnet bench`: work-precision tables and diagrams."""
 
 import dataclasses
-import json
 import math
 import pathlib
 from typing import Any
@@ -11,12 +10,13 @@ from rich.table import Table
 
 from ..errors import FormatError
 from ..evaluation import JITTER, Work, bench_scenes, bench_simulation, time_to_error
-from ..files import whole_file
+from ..files import whole_file, write_json
 from ..io import load_garment
 from ..motion import load_motion
 from ..viewer import draw_work_precision
 from ._experiment_commands import Bench
 from ._machine import machine
+from ._rows import kept_rows
 
 
 def bench(command: Bench, console: Console) -> int:
@@ -27,9 +27,7 @@ def bench(command: Bench, console: Console) -> int:
     action = None if command.motion == "punch" else load_motion(command.motion, fps=30.0)
     scenes = bench_scenes(shirt, action, command.frames)
     scenes = [b for b in scenes if b.name in command.scenes]
-    rows: list[Work] = []
-    if command.out is not None and command.out.is_file():
-        rows = [_from_json(r) for r in json.loads(command.out.read_text())["rows"]]
+    rows = kept_rows(command.out, _from_json)
     with console.status("bench") as status:
         for row in bench_simulation(
             scenes,
@@ -64,12 +62,7 @@ def _label(r: Work) -> str:
 
 
 def _write(path: pathlib.Path, rows: list[Work]) -> None:
-    data = [
-        {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in asdict.items()}
-        for asdict in map(dataclasses.asdict, rows)
-    ]
-    with whole_file(path) as part:
-        part.write_text(json.dumps({"machine": machine(), "rows": data}, indent=1) + "\n")
+    write_json(path, {"machine": machine(), "rows": [dataclasses.asdict(r) for r in rows]})
 
 
 def _from_json(row: dict[str, Any]) -> Work:

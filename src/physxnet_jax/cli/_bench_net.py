@@ -23,7 +23,7 @@ from ..dressing import (
 )
 from ..errors import FormatError
 from ..evaluation import ENGINES
-from ..files import whole_file
+from ..files import whole_file, write_json
 from ..garment import TEMPLATES, Template
 from ..io import load_predictor
 from ..models import at_precision
@@ -32,6 +32,7 @@ from ..viewer import draw_work_precision
 from ._experiment_commands import Bench
 from ._machine import machine
 from ._progress import progress_bars
+from ._rows import kept_rows
 
 
 def bench_net(command: Bench, console: Console) -> int:
@@ -44,9 +45,7 @@ def bench_net(command: Bench, console: Console) -> int:
         if not tests:
             raise FormatError(f"{command.data}: no 'test' actions; build a dataset first.")
     known_errors = _evaluated(command.errors)
-    rows: list[Cost] = []
-    if command.out is not None and command.out.is_file():
-        rows = [_from_json(r) for r in json.loads(command.out.read_text())["rows"]]
+    rows = kept_rows(command.out, _from_json)
     plain: Precision = "float32"
     jobs: list[tuple[str, str, Precision]] = [("lbs", "-", plain)]
     jobs.extend(("engine" if s in ENGINES else "simulator", s, plain) for s in command.simulator)
@@ -71,10 +70,7 @@ def bench_net(command: Bench, console: Console) -> int:
             rows.sort(key=_place)
             if command.out is not None:
                 data = [_to_json(r) for r in rows]
-                with whole_file(command.out) as part:
-                    part.write_text(
-                        json.dumps({"machine": machine(), "rows": data}, indent=1) + "\n"
-                    )
+                write_json(command.out, {"machine": machine(), "rows": data})
         progress("methods", len(jobs), len(jobs))
     text = markdown(rows)
     console.print(text, markup=False, highlight=False, soft_wrap=True)

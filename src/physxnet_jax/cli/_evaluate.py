@@ -2,18 +2,19 @@
 
 import collections
 import dataclasses
-import json
 import math
 import pathlib
 from collections.abc import Callable, Mapping, Sequence as Items
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 from ..data import Sequence, list_sequences, read_sequence
 from ..dressing import method_by_name, weights_folder
-from ..errors import FormatError, PhysXNetError
+from ..errors import FormatError, PhysXNetError, WeightsError
 from ..evaluation import (
+    DIGITS,
     ENGINES,
     ActionError,
     Method,
@@ -26,13 +27,14 @@ from ..evaluation import (
     summary_table,
     training_frames,
 )
-from ..files import whole_file
-from ..io import load_predictor
+from ..files import whole_file, write_json
+from ..io import load_predictor, read_card
 from ..simulation import ACCURACY
 from ..training import usable_garment
 from ..viewer import draw_bars
 from ._experiment_commands import Evaluate
 from ._progress import print_json, progress_bars
+from ._rows import kept_rows
 
 
 def evaluate(command: Evaluate, console: Console) -> int:
@@ -47,6 +49,8 @@ def evaluate(command: Evaluate, console: Console) -> int:
         raise PhysXNetError(f"two methods are called {twice[0]}; rename a run's folder.")
     rows = _read(command.out)
     sequences = [read_sequence(f) for f in folders]
+    digests = {_label(name): _digest(name) for name in command.methods}
+    _check_rows(rows, digests, sequences, command.out)
     with progress_bars(console) as progress:
         # What has all its rows needn't be at hand.
         wanted = [
@@ -67,7 +71,7 @@ def evaluate(command: Evaluate, console: Console) -> int:
             for row in measure(
                 methods, sequences, templates=command.templates, done=rows, report=show
             ):
-                rows.append(row)
+                rows.append(dataclasses.replace(row, weights=digests[row.method]))
                 if command.out is not None:
                     _write(command.out, rows)
     for engine in dict.fromkeys(r.engine for r in rows):
@@ -91,6 +95,43 @@ def evaluate(command: Evaluate, console: Console) -> int:
     return 0
 
 
+def _digest(name: str) -> str:
+    """The checksum of a network's weights; nothing for what is none, or isn't at hand."""
+    try:
+        return str(read_card(weights_folder(name.removesuffix("+push")))["sha256"])[:DIGITS]
+    except (WeightsError, LookupError):
+        return ""
+
+
+def _check_rows(
+    rows: Items[ActionError],
+    digests: Mapping[str, str],
+    sequences: Items[Sequence],
+    out: pathlib.Path | None,
+) -> None:
+    """Fails where a row was measured with other weights, or against another simulation.
+
+    What wasn't noted isn't compared.
+    """
+    data = {
+        (s.meta[t]["engine"], s.name, t): str(s.meta[t].get("sha256", ""))[:DIGITS]
+        for s in sequences
+        for t in s.offsets
+    }
+    for r in rows:
+        pairs = (
+            ("weights", r.weights, digests.get(r.method, "")),
+            ("simulation", r.data, data.get((r.engine, r.action, r.template), "")),
+        )
+        for what, then, now in pairs:
+            if then and now and then != now:
+                raise PhysXNetError(
+                    f"{out}: {r.method} on {r.action} was measured with another"
+                    f" {'network of that name' if what == 'weights' else 'simulation'}. Name"
+                    " another --out, or delete that file."
+                )
+
+
 def _measured(
     label: str, sequences: Items[Sequence], command: Evaluate, rows: Items[ActionError]
 ) -> bool:
@@ -109,14 +150,16 @@ def _panel(row: ActionError) -> str:
 
 
 def _read(path: pathlib.Path | None) -> list[ActionError]:
-    if path is None or not path.is_file():
-        return []
-    return [ActionError(**row) for row in json.loads(path.read_text())]
+    return kept_rows(path, _from_json)
+
+
+def _from_json(row: dict[str, Any]) -> ActionError:
+    values: dict[str, Any] = {k: math.nan if v is None else v for k, v in row.items()}
+    return ActionError(**values)
 
 
 def _write(path: pathlib.Path, rows: list[ActionError]) -> None:
-    with whole_file(path) as part:
-        part.write_text(json.dumps([_rounded(r) for r in rows], indent=1) + "\n")
+    write_json(path, [_rounded(r) for r in rows])
 
 
 def _rounded(row: ActionError) -> Mapping[str, object]:
@@ -125,7 +168,7 @@ def _rounded(row: ActionError) -> Mapping[str, object]:
     return {
         k: float(f"{v:.5g}") if isinstance(v, float) else v
         for k, v in dataclasses.asdict(row).items()
-        if not (k in optional and math.isnan(v))
+        if not (k in optional and (v == "" or v != v))
     }
 
 

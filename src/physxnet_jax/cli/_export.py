@@ -10,7 +10,7 @@ from ._progress import print_json
 def export(command: Export, console: Console) -> int:
     """Writes the function and says how to call it."""
     with console.status("binding and lowering"):
-        dresser = make_dresser(command.wear, weights=command.weights, resolve=command.push_out)
+        dresser = make_dresser(command.wear, weights=command.weights, push_out=command.push_out)
         files = export_dresser(
             command.out,
             dresser,

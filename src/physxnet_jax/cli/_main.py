@@ -271,7 +271,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
             "method": command.method,
             "accuracy": command.accuracy,
             "weights": command.weights,
-            "resolve": command.push_out,
+            "push_out": command.push_out,
         }
         picked = choose(command, progress)
         if picked is not None:

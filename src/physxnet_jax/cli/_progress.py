@@ -1,12 +1,12 @@
 """What a terminal shows: progress bars with the time left; and what machines read."""
 
 import contextlib
-import json
-import pathlib
 from collections.abc import Callable, Iterator
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+
+from ..files import json_text
 
 
 @contextlib.contextmanager
@@ -33,10 +33,4 @@ def progress_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]
 
 def print_json(values: object) -> None:
     """One JSON text, whatever the width of the terminal."""
-    print(json.dumps(values, indent=1, default=_plain))  # noqa: T201
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, pathlib.Path):
-        return str(value)
-    raise TypeError(f"{type(value).__name__} isn't written as JSON")
+    print(json_text(values))  # noqa: T201

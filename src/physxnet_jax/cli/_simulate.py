@@ -1,7 +1,6 @@
 """`physxnet simulate` and `physxnet effects`."""
 
 import dataclasses
-import json
 import pathlib
 import time
 
@@ -13,7 +12,7 @@ from ..body import load_body
 from ..dressing import SceneFile, animated_meshes, load_scene, make_scene
 from ..errors import FormatError
 from ..evaluation import ENGINES, price_effects, recommend_effects
-from ..files import whole_file
+from ..files import write_json
 from ..io import check_output, write_clip
 from ..simulation import (
     ACCURACY,
@@ -109,7 +108,7 @@ def _report(rollout: Rollout, effects: tuple[Effect, ...], took: float) -> dict[
         "fps": rollout.fps,
         "seconds": took,
         "effects": [type(e).__name__ for e in effects],
-        "worst": {k: float(np.max(v)) for k, v in rollout.diagnostics.items()},
+        "worst": rollout.worst,
         "frames_marked": {k: n for k, n in marked.items() if n},
     }
 
@@ -144,6 +143,7 @@ _SHOWN = {
     "penetration_max": ("deepest in the skin (mm)", 1e3),
     "inside_share": ("vertices in the skin, worst frame (%)", 100.0),
     "layers_crossed": ("vertices in the wrong layer, worst frame", 1.0),
+    "self_gap": ("least gap of cloth to itself (mm)", 1e3),
     "pinched": ("vertices within another limb, worst frame", 1.0),
     "residual_p99": ("residual, 99th percentile (1 = tolerance)", 1.0),
     "speed_max": ("fastest vertex (m/s)", 1.0),
@@ -159,8 +159,8 @@ def _summary(rollout: Rollout, effects: tuple[Effect, ...], took: float) -> Tabl
     table.add_column("over all frames")
     table.add_column("worst", justify="right")
     for key, (name, scale) in _SHOWN.items():
-        if key in rollout.diagnostics:
-            table.add_row(name, f"{scale * float(np.max(rollout.diagnostics[key])):.3g}")
+        if key in rollout.worst:
+            table.add_row(name, f"{scale * rollout.worst[key]:.3g}")
     for flag in Status:
         count = int(np.count_nonzero(rollout.status & int(flag)))
         if count:
@@ -225,8 +225,7 @@ def price(command: Effects, console: Console) -> int:
         "notes": list(job.notes),
     }
     if command.out is not None:
-        with whole_file(command.out) as part:
-            part.write_text(json.dumps(data, indent=1) + "\n")
+        write_json(command.out, data)
     if command.json:
         print_json(data)
     return 0

@@ -1,7 +1,6 @@
 """`physxnet stress`: the table of hard cases."""
 
 import dataclasses
-import json
 
 import jax
 from rich.console import Console
@@ -10,7 +9,7 @@ from rich.table import Table
 
 from ..errors import PhysXNetError
 from ..evaluation import CASES, ENGINES, PEER_CASES, Finding, run_case, run_peer
-from ..files import whole_file
+from ..files import write_json
 from ._experiment_commands import Stress
 from ._progress import print_json
 
@@ -62,8 +61,7 @@ def stress(command: Stress, console: Console) -> int:
         console.print(f"{p}: {held} of {len(tried)} bounds hold", highlight=False)
     data = [{**dataclasses.asdict(r), "holds": r.holds, **beside(r)} for r in rows]
     if command.out is not None:
-        with whole_file(command.out) as part:
-            part.write_text(json.dumps(data, indent=1) + "\n")
+        write_json(command.out, data)
     if command.json:
         print_json(data)
     return 0 if all(r.holds for r in rows) else 1

@@ -141,8 +141,19 @@ def left_out(folder: str | pathlib.Path, actions: list[Action]) -> list[Action]:
 
 
 def load_action(folder: str | pathlib.Path, action: Action) -> Motion:
-    """The frames of an action, at 30 a second, by spherical interpolation."""
+    """The frames of an action, at 30 a second, by spherical interpolation.
+
+    Raises:
+        MotionError: Its file can't be read, or isn't as long.
+    """
     clip = load_motion(pathlib.Path(folder) / action.file, source_fps=action.fps)
+    end = action.start + (action.frames - 1) / FPS
+    last = (clip.num_frames - 1) / clip.fps
+    if not (action.start >= 0.0 and end <= last + 1e-3):
+        raise MotionError(
+            f"{action.file}: {action.name} goes from {action.start:g} to {end:.2f} s, the clip to"
+            f" {last:.2f} s. Correct the table of actions."
+        )
     times = action.start + np.arange(action.frames) / FPS
     motion = sample(clip, times, FPS)
     return Motion(motion.rotations, motion.root, FPS, action.name)

@@ -4,6 +4,7 @@
 action's folder the motion and an array for each garment. The body follows from the motion.
 """
 
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -11,6 +12,7 @@ import json
 import os
 import pathlib
 import shutil
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -18,7 +20,7 @@ import tensorstore as ts
 from jaxtyping import Float, Int
 
 from ..errors import FormatError
-from ..files import whole_file
+from ..files import read_arrays, whole_file
 from ..motion import Motion, load_motion, save_motion
 from ._codec import Codec, make_codec
 
@@ -78,7 +80,8 @@ def read_note(root: str | pathlib.Path) -> dict[str, Any]:
     path = pathlib.Path(root) / _NOTE
     if not path.is_file():
         raise FormatError(f"{root}: no {_NOTE}, not a dataset; build one first.")
-    return json.loads(path.read_text())
+    with _damage_told(path):
+        return json.loads(path.read_text())
 
 
 def write_garment(
@@ -87,10 +90,27 @@ def write_garment(
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
 ) -> None:
-    """Stores a garment at rest [m] and how its offsets are coded, once."""
+    """Stores a garment at rest [m] and how its offsets are coded, once.
+
+    Raises:
+        FormatError: Another garment lies there under that name, or one of too many vertices.
+    """
     path = pathlib.Path(root) / "garments" / f"{name}.npz"
     if path.is_file():
+        before = _archive(path)
+        if not (
+            np.array_equal(before["faces"], faces)
+            and np.allclose(before["vertices"], vertices, atol=1e-5)
+        ):
+            raise FormatError(
+                f"{path}: another garment of that name lies there; what is stored was told from"
+                " it. Choose another folder, or delete it."
+            )
         return
+    if len(vertices) > np.iinfo(np.int16).max:
+        raise FormatError(
+            f"{name}: {len(vertices):,} vertices; a dataset's garments have 32,767 at most."
+        )
     codec = make_codec(vertices, faces)
     with whole_file(path) as part:
         np.savez_compressed(
@@ -105,8 +125,29 @@ def write_garment(
 
 @functools.lru_cache(maxsize=8)
 def _codec(path: pathlib.Path, changed: int) -> Codec:
-    with np.load(path) as data:
-        return Codec(*(data[k].astype(np.int64) for k in ("order", "parents", "weights")))
+    data = _archive(path)
+    return Codec(*(data[k].astype(np.int64) for k in ("order", "parents", "weights")))
+
+
+def _archive(path: pathlib.Path) -> dict[str, np.ndarray]:
+    names = ("vertices", "faces", "order", "parents", "weights")
+    with _damage_told(path):
+        data = read_arrays(path, names)
+        return {name: data[name] for name in names}
+
+
+@contextlib.contextmanager
+def _damage_told(path: pathlib.Path) -> Iterator[None]:
+    """What a library says of a damaged file, as `FormatError`."""
+    try:
+        yield
+    except FormatError:
+        raise
+    except (ValueError, LookupError, TypeError, OSError) as error:
+        raise FormatError(
+            f"{path}: damaged ({type(error).__name__}). Delete its folder and build the dataset"
+            " again: only this part will be simulated."
+        ) from error
 
 
 def _codec_of(folder: pathlib.Path, template: str) -> Codec:
@@ -188,11 +229,11 @@ def read_offsets(folder: pathlib.Path, template: str) -> Float[np.ndarray, "fram
     Raises:
         FormatError: Damaged.
     """
-    store = ts.open(
-        {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(folder / template)}},
-        read=True,
-    ).result()
-    left = np.ascontiguousarray(store.read().result())
+    path = folder / template
+    with _damage_told(path):
+        spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(path)}}
+        store = ts.open(spec, read=True).result()
+        left = np.ascontiguousarray(store.read().result())
     if hashlib.sha256(left.tobytes()).hexdigest() != read_meta(folder, template)["sha256"]:
         raise FormatError(
             f"{folder.name}/{template}: the checksum is wrong; delete that folder and build"
@@ -203,8 +244,14 @@ def read_offsets(folder: pathlib.Path, template: str) -> Float[np.ndarray, "fram
 
 
 def read_meta(folder: pathlib.Path, template: str) -> dict[str, Any]:
-    """What was noted of one garment of one action."""
-    return json.loads((folder / template / "zarr.json").read_text())["attributes"]
+    """What was noted of one garment of one action.
+
+    Raises:
+        FormatError: Damaged.
+    """
+    path = folder / template / "zarr.json"
+    with _damage_told(path):
+        return json.loads(path.read_text())["attributes"]
 
 
 def is_stored(folder: pathlib.Path, template: str) -> bool:
@@ -223,14 +270,21 @@ def write_action(folder: pathlib.Path, motion: Motion, split: str) -> None:
     if there.is_file():
         before = load_motion(there)
         pairs = ((before.rotations, motion.rotations), (before.root, motion.root))
-        if not all(a.shape == b.shape and np.allclose(a, b, atol=1e-4) for a, b in pairs):
+        same = all(a.shape == b.shape and np.allclose(a, b, atol=1e-4) for a, b in pairs)
+        if not same or before.fps != motion.fps:
             raise FormatError(
                 f"{folder}: its motion isn't the one that is simulated now, by other files or"
                 " another version. Delete that folder, or build into another one."
             )
     else:
         save_motion(there, motion)
-    with whole_file(folder / "action.json") as part:
+    note = folder / "action.json"
+    if note.is_file() and _action_note(note)["split"] != split:
+        raise FormatError(
+            f"{folder}: stored as '{_action_note(note)['split']}', now '{split}'. A set whose"
+            " splits changed has to be built anew: choose another folder."
+        )
+    with whole_file(note) as part:
         part.write_text(json.dumps({"name": motion.name, "split": split}))
 
 
@@ -244,7 +298,7 @@ def read_sequence(folder: str | pathlib.Path) -> Sequence:
     note = folder / "action.json"
     if not note.is_file():
         raise FormatError(f"{folder}: no action.json, not an action of a dataset.")
-    info = json.loads(note.read_text())
+    info = _action_note(note)
     motion = load_motion(folder / "motion.npz")
     # What begins with a dot is being written, or was when its process was killed.
     found = sorted(p.parent.name for p in folder.glob("[!.]*/zarr.json"))
@@ -261,9 +315,15 @@ def list_sequences(root: str | pathlib.Path, split: str | None = None) -> list[p
     """Folders of a dataset's actions, sorted, optionally of one split."""
     out = []
     for note in sorted(pathlib.Path(root).glob("*/action.json")):
-        if split is None or json.loads(note.read_text())["split"] == split:
+        if split is None or _action_note(note)["split"] == split:
             out.append(note.parent)
     return out
+
+
+def _action_note(path: pathlib.Path) -> dict[str, str]:
+    with _damage_told(path):
+        told = json.loads(path.read_text())
+        return {"name": str(told["name"]), "split": str(told["split"])}
 
 
 def log_build(root: str | pathlib.Path, line: dict[str, Any]) -> None:

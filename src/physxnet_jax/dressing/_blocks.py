@@ -26,7 +26,7 @@ def lead_frames(predictor: Predictor | None) -> int:
     return 0 if predictor is None else predictor.config.inputs.window - 1
 
 
-@functools.partial(jax.jit, static_argnames=("fps", "resolve"))
+@functools.partial(jax.jit, static_argnames=("fps", "pushed"))
 def dress_block(
     predictor: Predictor | None,
     wearables: tuple[Wearable, ...],
@@ -35,7 +35,7 @@ def dress_block(
     rotations: Float[Array, "padded joints 3 3"],
     translations: Float[Array, "padded joints 3"],
     fps: float,
-    resolve: bool,
+    pushed: bool,
 ) -> tuple[tuple[Array, Array], ...]:
     """Garments of a block of frames and the share of vertices inside before push-out."""
     last = slice(lead_frames(predictor), None)
@@ -48,12 +48,12 @@ def dress_block(
     for x, patch in zip(raw, patches, strict=True):
 
         def one(x: Array, r: Array, t: Array, q: SkinPatch = patch) -> tuple[Array, Array]:
-            return push_out(q, x, r, t) if resolve else x, skin_height(q, x, r, t)[0]
+            return push_out(q, x, r, t) if pushed else x, skin_height(q, x, r, t)[0]
 
         x, height = each_frame(one, x, r, t)
         worn.append(x)
         inside.append(jnp.mean((height < 0).astype(x.dtype), axis=1))
-    if resolve:
+    if pushed:
         worn = lift_layers(layers, worn)
     return tuple(zip(worn, inside, strict=True))
 
@@ -66,7 +66,7 @@ def predict_clip(
     world: np.ndarray,
     shift: np.ndarray,
     fps: float,
-    resolve: bool,
+    pushed: bool,
     stages: list[Stage],
     progress: Callable[[str, int, int], None] | None,
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
@@ -85,7 +85,7 @@ def predict_clip(
             jnp.asarray(padded_block(world, start, lead)),
             jnp.asarray(padded_block(shift, start, lead)),
             fps,
-            resolve,
+            pushed,
         )
         blocks.append(jax.tree.map(np.asarray, out))
         times.append(1e3 * (time.perf_counter() - began))

@@ -100,11 +100,11 @@ def network_costs(
     """
     size = pathlib.Path(weights).name
     params = sum(x.size for x in jax.tree.leaves(predictor.state))
-    for resolve in (False, True):
-        method = "network+push" if resolve else "network"
+    for push_out in (False, True):
+        method = "network+push" if push_out else "network"
         for number in garments:
             dresser = make_dresser(
-                TEMPLATES[:number], weights=predictor, resolve=resolve, precision=precision
+                TEMPLATES[:number], weights=predictor, push_out=push_out, precision=precision
             )
             known = errors.get(method, {})
             for batch in batches:
@@ -253,7 +253,7 @@ def clothing_cost(
 
 
 def _without_loops(dresser: Dresser) -> bool:
-    return not dresser.resolve and not dresser.predictor.relaxation
+    return not dresser.push_out and not dresser.predictor.relaxation
 
 
 def _gradient(dresser: Dresser, motion: Motion, batch: int) -> dict[str, float]:

@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,10 +18,6 @@ from ..models import Predictor, Wearable, fold_batch_norm, make_surface, make_we
 from ..motion import (
     Motion,
     clip_transforms,
-    load_motion,
-    make_motion,
-    resample,
-    stand_on_floor,
 )
 from ..simulation import ACCURACY
 from ..uv import Binding, Transference, bind
@@ -37,6 +33,7 @@ from ._layers import make_layers
 from ._meshes import animated_meshes, worn_garments
 from ._push_out import make_patch, tuck_in
 from ._stages import Stage, Watch
+from ._wanted_clip import wanted_clip
 
 Method = Literal["network", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "lbs", "simulate")
@@ -94,7 +91,7 @@ def dress(
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
     include_body: bool = True,
-    resolve: bool = True,
+    push_out: bool = True,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> DressedClip:
     """Dresses a moving person.
@@ -113,7 +110,7 @@ def dress(
         body: The body; the built-in one by default.
         shape: Shape parameters; the default shape if omitted.
         include_body: Put the body's mesh into the result.
-        resolve: Push vertices that end inside the body onto it, and garments off those
+        push_out: Push vertices that end inside the body onto it, and garments off those
             beneath them (network and lbs).
         progress: Called with a stage, frames done and frames in all.
 
@@ -132,8 +129,6 @@ def dress(
         raise PhysXNetError(f"No method '{method}'; there are {', '.join(METHODS)}.")
     if accuracy not in ACCURACY:
         raise PhysXNetError(f"No accuracy '{accuracy}'; there are {', '.join(ACCURACY)}.")
-    if frames is not None and frames < 1:
-        raise PhysXNetError(f"frames is {frames}; ask for at least one.")
     person = motion if isinstance(motion, Character) else None
     if person is not None:
         if body is not None or shape is not None:
@@ -144,16 +139,8 @@ def dress(
     body = load_body() if body is None else body
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     with watch("motion"):
-        if isinstance(motion, Motion):
-            clip = make_motion(motion.rotations, motion.root, motion.fps, name=motion.name)
-            clip = clip if clip.fps == fps else resample(clip, fps)
-            if shape is not None:
-                clip = stand_on_floor(body, clip, rest)
-        else:
-            assert not isinstance(motion, Character)
-            clip = load_motion(motion, fps=fps, body=body, shape=shape)
-        if frames is not None:
-            clip = Motion(clip.rotations[:frames], clip.root[:frames], clip.fps, clip.name)
+        assert not isinstance(motion, Character)
+        clip = wanted_clip(motion, fps=fps, body=body, shape=shape, frames=frames)
         world, shift = clip_transforms(body, rest, clip)
     with watch("garments"):
         # A character's clothes are modelled on the body as it is, and carried over.
@@ -170,7 +157,7 @@ def dress(
         with watch("weights"):
             known = weights if isinstance(weights, Predictor) else load_predictor(weights)
             predictor = fold_batch_norm(known)
-            predictor = fit_surface(predictor, body, rest, shape)
+            predictor = fit_surface(predictor, body, rest)
         with watch("binding"):
             wearables = [bound_wearable(predictor, body, rest, g) for g in garments]
         for w in wearables:
@@ -188,7 +175,16 @@ def dress(
         inside_raw = None
     else:
         positions, inside_raw = predict_clip(
-            predictor, wearables, patches, layers, world, shift, clip.fps, resolve, stages, progress
+            predictor,
+            wearables,
+            patches,
+            layers,
+            world,
+            shift,
+            clip.fps,
+            push_out,
+            stages,
+            progress,
         )
     inside = {
         w.name: inside_share(p, positions[w.name], world, shift)
@@ -199,7 +195,7 @@ def dress(
             positions = {g.name: follow_leftover(g, person, positions[g.name]) for g in garments}
             # Both against the skin that is seen.
             inside_raw = {g.name: inside_character(person, positions[g.name]) for g in garments}
-            if resolve:
+            if push_out:
                 positions = {
                     w.name: clear_of_character(p, w, person, positions[w.name], world, shift)
                     for w, p in zip(wearables, patches, strict=True)
@@ -226,19 +222,14 @@ def dress(
     )
 
 
-def fit_surface(
-    predictor: Predictor, body: Body, rest: Float[Array, "all 3"], shape: Any | None
-) -> Predictor:
-    """The predictor with its texels on a body of another shape.
+def fit_surface(predictor: Predictor, body: Body, rest: Float[Array, "all 3"]) -> Predictor:
+    """The predictor with its texels on a body of a shape.
 
     Args:
-        predictor: Of the built-in body's default shape.
+        predictor: Of any shape.
         body: The body.
         rest: `Body.rest_vertices` of the shape [m].
-        shape: Its parameters, None for the default shape.
     """
-    if shape is None and body is load_body():
-        return predictor
     surface = make_surface(predictor.atlas, body, rest, predictor.surface.valid)
     return dataclasses.replace(predictor, surface=surface)
 

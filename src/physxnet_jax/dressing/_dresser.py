@@ -33,16 +33,6 @@ from ._push_out import SkinPatch, make_patch, push_out, tuck_in
 Precision = Literal["float32", "bfloat16"]
 
 
-class _Notes(tuple[str, ...]):
-    """What is told of files: all are alike to a program, which isn't compiled again for them."""
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Notes) or super().__eq__(other)
-
-    def __hash__(self) -> int:
-        return 0
-
-
 @pytree
 @dataclasses.dataclass(frozen=True)
 class Dresser:
@@ -56,8 +46,9 @@ class Dresser:
         patches: The skin that each garment is pushed out of.
         layers: Which garments lie over which, innermost first.
         garments: The same at rest on the body's default shape, and what carries them.
-        resolve: Whether vertices inside the body are moved out of it.
-        notes: What the reader should know about the garments' files.
+        push_out: Whether vertices inside the body are moved out of it.
+        notes: What the reader should know about the garments' files; no part of the
+            pytree, so gone from what a transformed function returns.
     """
 
     body: Body
@@ -67,8 +58,8 @@ class Dresser:
     patches: tuple[SkinPatch, ...]
     layers: tuple[Layer, ...]
     garments: tuple[Garment, ...]
-    resolve: bool = dataclasses.field(metadata={"static": True})
-    notes: tuple[str, ...] = dataclasses.field(default=(), metadata={"static": True})
+    push_out: bool = dataclasses.field(metadata={"static": True})
+    notes: tuple[str, ...] = dataclasses.field(default=(), metadata={"told": True})
 
     @property
     def faces(self) -> tuple[Int[Array, "faces 3"], ...]:
@@ -121,7 +112,7 @@ def make_dresser(
     weights: str | pathlib.Path | Predictor = DEFAULT,
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
-    resolve: bool = True,
+    push_out: bool = True,
     precision: Precision = "float32",
 ) -> Dresser:
     """Loads weights and binds garments, once for all poses.
@@ -132,7 +123,7 @@ def make_dresser(
         weights: Name or folder of network weights, or a predictor.
         body: The body; the built-in one by default.
         shape: Shape parameters; the default shape if omitted.
-        resolve: Push vertices that end inside the body onto it, and garments off those
+        push_out: Push vertices that end inside the body onto it, and garments off those
             beneath them.
         precision: Of the network's arithmetic; all else stays float32.
 
@@ -144,7 +135,7 @@ def make_dresser(
     garments, notes = worn_garments(wear, body)
     garments = [as_on(body, g) for g in garments]
     predictor = weights if isinstance(weights, Predictor) else load_predictor(weights)
-    predictor = at_precision(fit_surface(predictor, body, rest, shape), precision)
+    predictor = at_precision(fit_surface(predictor, body, rest), precision)
     wearables = tuple(bound_wearable(predictor, body, rest, g) for g in garments)
     patches = tuck_in(
         [make_patch(body, rest, w, g.mesh) for w, g in zip(wearables, garments, strict=True)],
@@ -152,7 +143,7 @@ def make_dresser(
     )
     layers = make_layers(body, rest, wearables, garments)
     return Dresser(
-        body, rest, predictor, wearables, patches, layers, tuple(garments), resolve, _Notes(notes)
+        body, rest, predictor, wearables, patches, layers, tuple(garments), push_out, notes
     )
 
 
@@ -247,7 +238,7 @@ def clothe(
     raw = dress_frames(
         dresser.predictor, dresser.wearables, pad_clip(world, inputs), pad_clip(shift, inputs), fps
     )
-    if dresser.resolve:
+    if dresser.push_out:
         raw = lift_layers(
             dresser.layers,
             [
@@ -304,7 +295,7 @@ def clothe_frame(
     world, shift = dresser.body.transforms(dresser.rest, rotations, root)
     stream, raw = stream_frame(dresser.predictor, dresser.wearables, stream, world, shift, fps)
     worn = list(raw)
-    if dresser.resolve:
+    if dresser.push_out:
         worn = [push_out(p, x, world, shift) for x, p in zip(raw, dresser.patches, strict=True)]
         for layer in dresser.layers:
             worn[layer.outer] = lift_off(layer, worn[layer.inner], worn[layer.outer])

@@ -105,7 +105,7 @@ def export_dresser(
         "rotations": "unit quaternions wxyz relative to the parent, [frames, joints, 4]",
         "root": "position of the first joint, metres, Y up, [frames, 3]",
         "garments": {w.name: int(w.rest.shape[0]) for w in dresser.wearables},
-        "push_out": dresser.resolve,
+        "push_out": dresser.push_out,
         "asked_mirrored": dresser.predictor.mirrored,
         "relaxation_steps": dresser.predictor.relaxation,
         "weights": {k: v for k, v in read_card(name).items() if k != "measured"} if name else {},

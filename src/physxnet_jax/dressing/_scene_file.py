@@ -11,10 +11,11 @@ from jaxtyping import Array, Float
 from ..body import load_body
 from ..errors import FormatError
 from ..garment import FABRICS, Garment
-from ..motion import Motion, load_motion, make_motion, resample
+from ..motion import Motion
 from ..simulation import ACCURACY, EFFECTS, Effect, Scene, standard_effects
 from ._layers import inside_out
 from ._meshes import worn_garments
+from ._wanted_clip import wanted_clip
 
 _KEYS: dict[str, type | tuple[type, ...]] = {
     "motion": str,
@@ -87,23 +88,16 @@ def make_scene(
     if fabric is not None and fabric not in FABRICS:
         raise FormatError(f"No fabric '{fabric}'; there are {', '.join(FABRICS)}.")
     body = load_body()
-    if isinstance(motion, Motion):
-        clip = make_motion(motion.rotations, motion.root, motion.fps, name=motion.name)
-        clip = clip if fps in (None, clip.fps) else resample(clip, fps)
-    else:
-        clip = load_motion(
-            motion,
-            fps=30.0 if fps is None else fps,
-            source_fps=source_fps,
-            skeleton=skeleton,
-            joint_map=joint_map,
-            body=body,
-            shape=shape,
-        )
-    if frames is not None:
-        if frames < 1:
-            raise FormatError(f"frames is {frames}; ask for at least one.")
-        clip = dataclasses.replace(clip, rotations=clip.rotations[:frames], root=clip.root[:frames])
+    clip = wanted_clip(
+        motion,
+        fps=fps,
+        body=body,
+        shape=shape,
+        frames=frames,
+        source_fps=source_fps,
+        skeleton=skeleton,
+        joint_map=joint_map,
+    )
     garments, notes = worn_garments(wear, body)
     if fabric is not None:
         garments = [dataclasses.replace(g, fabric=FABRICS[fabric]) for g in garments]
@@ -143,8 +137,11 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         FormatError: Not TOML, an unknown key, effect or setting.
     """
     path = pathlib.Path(path)
+    if not path.is_file():
+        raise FormatError(f"{path}: no such file. Check the path.")
     try:
-        text = tomllib.loads(path.read_text())
+        with path.open("rb") as file:
+            text = tomllib.load(file)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise FormatError(f"{path}: not a scene in TOML: {error}.") from None
     unknown = sorted(set(text) - set(_KEYS))
@@ -229,6 +226,10 @@ def _value(field: dataclasses.Field, value: Any) -> Any:
     wants_float = field.type is float or "float" in str(field.type)
     if wants_float and (isinstance(value, bool) or not isinstance(value, int | float)):
         raise TypeError(f"{field.name} is {value!r}, expected a number")
+    if field.type is int and (isinstance(value, bool) or not isinstance(value, int)):
+        raise TypeError(f"{field.name} is {value!r}, expected a whole number")
+    if field.type is bool and not isinstance(value, bool):
+        raise TypeError(f"{field.name} is {value!r}, expected true or false")
     return float(value) if isinstance(value, int) and wants_float else value
 
 

@@ -17,6 +17,7 @@ from ._bench import (
 )
 from ._dataset_check import check_sequence as check_sequence
 from ._evaluate import (
+    DIGITS as DIGITS,
     ActionError as ActionError,
     evaluate as evaluate,
     means as means,

@@ -30,6 +30,8 @@ from ._strain import edge_strain
 _RESOLUTION = 128
 # Penetration is looked for in every fifth frame: it takes longer than all else.
 _EVERY = 5
+DIGITS = 16
+"""Of checksums that are noted in rows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,6 +65,8 @@ class ActionError:
         ms_per_frame: From joint rotations to this template's vertices, warm.
         fold_strength: Over that of the reference, see there [1].
         strain_p99_reference: ``strain_p99`` of the reference.
+        data: Checksum of the reference's offsets; empty where it wasn't noted.
+        weights: That of the network's weights, likewise.
     """
 
     engine: str
@@ -90,6 +94,8 @@ class ActionError:
     ms_per_frame: float
     fold_strength: float = math.nan
     strain_p99_reference: float = math.nan
+    data: str = ""
+    weights: str = ""
 
 
 def evaluate(
@@ -196,6 +202,8 @@ class _Reference:
             "finite_share": float(finite.mean()),
             "ms_per_frame": answer.ms_per_frame,
             "jitter_reference": jitter(reference, motion.fps),
+            "data": str(sequence.meta[name].get("sha256", ""))[:DIGITS],
+            "weights": "",
         }
         if not len(x):
             return ActionError(**values)

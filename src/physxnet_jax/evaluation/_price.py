@@ -131,7 +131,7 @@ def recommend_effects(
         rows: What `price_effects` gave, if it was called before.
         progress: Called with variants done and variants in all.
     """
-    rows = price_effects(scene, motion, solver=solver) if rows is None else rows
+    rows = price_effects(scene, motion, solver=solver, progress=progress) if rows is None else rows
     base = rows[0]
     out = []
     for r in rows[1:]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+import math
 import pathlib
 from collections.abc import Mapping
 
@@ -62,12 +63,17 @@ def read_character(
 
     Raises:
         FormatError: No such format, a damaged file, no such mesh, nothing as high as a
-            person in any unit.
+            person in any unit; a rate or a number of frames that isn't positive.
         MotionError: A damaged glTF.
         MissingDependencyError: Without the library that reads it.
     """
     path = pathlib.Path(path)
     suffix = path.suffix.lower()
+    for name, value in (("fps", fps), ("source_fps", source_fps)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise FormatError(f"{name} is {value}, expected a positive number.")
+    if frames is not None and frames < 1:
+        raise FormatError(f"frames is {frames}; ask for at least one.")
     if suffix not in CHARACTER_FORMATS:
         raise FormatError(
             f"{path}: no animated person is read from '{suffix}', only from"

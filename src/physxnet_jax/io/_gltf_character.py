@@ -135,7 +135,8 @@ def _primitive(
         faces = np.arange(len(x) // 3 * 3)
     else:
         faces = np.asarray(file.accessor(primitive.indices))  # pyright: ignore[reportAttributeAccessIssue]
-    if faces.ndim != 1 or not len(faces) or len(faces) % 3 or faces.max() >= len(x):
+    whole = faces.ndim == 1 and len(faces) > 0 and len(faces) % 3 == 0
+    if not whole or faces.min() < 0 or faces.max() >= len(x):
         raise FormatError(f"{file.path}: faces of '{name}' aren't triangles over its vertices.")
     faces = faces.reshape(-1, 3).astype(np.int32)
     positions = x[None]
@@ -227,6 +228,10 @@ def _skinned(
     return dataclasses.replace(part, positions=out, bind=bind.astype(np.float32))
 
 
+def _within(which: np.ndarray, count: int) -> bool:
+    return bool(which.dtype.kind in "iu" and which.min() >= 0 and which.max() < count)
+
+
 def _joint_weights(
     file: GltfFile, primitive: object, part: Moving, joints: int
 ) -> Float[np.ndarray, "vertices joints"]:
@@ -241,7 +246,8 @@ def _joint_weights(
         if which is None or share is None:
             continue
         which, share = np.asarray(file.accessor(which)), np.asarray(file.accessor(share), float)
-        if which.shape != (vertices, 4) or share.shape != (vertices, 4) or which.max() >= joints:
+        fits = which.shape == (vertices, 4) and share.shape == (vertices, 4)
+        if not fits or not _within(which, joints):
             raise FormatError(f"{file.path}: skin weights of '{part.name}' don't fit its vertices.")
         np.add.at(out, (np.arange(vertices)[:, None], which.astype(int)), share)
     total = out.sum(axis=1, keepdims=True)

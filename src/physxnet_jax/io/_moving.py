@@ -10,6 +10,9 @@ from jaxtyping import Float, Int
 from ..errors import FormatError
 from ..geometry import Polygons, joined_polygons
 
+# Vertices within this share of a mesh's size of each other, in all frames, are one.
+_TOGETHER = 3e-6
+
 
 @dataclasses.dataclass(frozen=True)
 class Moving:
@@ -83,16 +86,42 @@ def joined(parts: Sequence[Moving]) -> Moving:
     )
 
 
+def _parted(
+    x: Float[np.ndarray, "frames vertices 3"],
+    first: Int[np.ndarray, " groups"],
+    index: Int[np.ndarray, " vertices"],
+) -> tuple[Int[np.ndarray, " more"], Int[np.ndarray, " vertices"]]:
+    """Groups of vertices of one place, split where members go different ways in any frame.
+
+    Lips or hands that touch are no seam.
+    """
+    size = max(float(np.ptp(x[0], axis=0).max()), 1e-9)
+    rows = np.flatnonzero(np.bincount(index)[index] > 1)
+    while len(rows):
+        leads = first[index[rows]]
+        far = np.zeros(len(rows), dtype=bool)
+        for frame in x:
+            far |= np.abs(frame[rows] - frame[leads]).max(axis=1) > _TOGETHER * size
+        rows = rows[far]
+        # Those that left a group may belong together.
+        _, begin, group = np.unique(index[rows], return_index=True, return_inverse=True)
+        index[rows] = len(first) + group
+        first = np.concatenate([first, rows[begin]])
+    return first, index
+
+
 def welded(part: Moving) -> Moving:
     """Vertices that were doubled at texture seams become one again."""
     place = part.positions[0] if part.bind is None else part.bind
-    both = np.concatenate([place, part.positions[-1]], axis=1)
-    keys = np.round(both / max(float(np.ptp(place, axis=0).max()), 1e-9) * 1e6)
-    _, first, index = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    size = max(float(np.ptp(place, axis=0).max()), 1e-9)
+    _, first, index = np.unique(
+        np.round(place / size * 1e6), axis=0, return_index=True, return_inverse=True
+    )
+    first, index = _parted(part.positions, first, index.reshape(-1))
     # In the file's order, so that a mesh without seams stays as it was.
     order = np.argsort(first)
     first, rank = first[order], np.argsort(order)
-    row = rank[index.reshape(-1)]
+    row = rank[index]
     faces = row[part.faces].astype(np.int32)
     whole = (
         (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])

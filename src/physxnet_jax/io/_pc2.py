@@ -24,16 +24,21 @@ def read_pc2(path: str | pathlib.Path) -> Float[np.ndarray, "frames vertices 3"]
     """Positions of a PC2 cache.
 
     Raises:
-        FormatError: Not a PC2, or shorter than its header says.
+        FormatError: Not a PC2, shorter than its header says, or without a sample for
+            every frame.
     """
     blob = pathlib.Path(path).read_bytes()
     if len(blob) < _HEADER.size or not blob.startswith(b"POINTCACHE2\0"):
         raise FormatError(f"{path}: not a PC2 cache. Export it again as PC2.")
-    _, _, vertices, _, _, frames = _HEADER.unpack_from(blob)
+    _, _, vertices, _, step, frames = _HEADER.unpack_from(blob)
     if vertices < 1 or frames < 1 or len(blob) != _HEADER.size + 12 * vertices * frames:
         raise FormatError(
             f"{path}: {len(blob)} bytes, but the header announces {frames} frames of"
             f" {vertices} points. It is truncated: write it again."
+        )
+    if not (np.isfinite(step) and abs(step - 1.0) < 1e-3):
+        raise FormatError(
+            f"{path}: a sample every {step:g} frames. Export it with a sample for each frame."
         )
     data = np.frombuffer(blob, "<f4", offset=_HEADER.size)
     return data.reshape(frames, vertices, 3).astype(np.float32)

@@ -79,14 +79,13 @@ def save_predictor(
             f" without that; name the weights with {MIRROR} or {RELAX} when they are loaded."
         )
     tensors: dict[str, np.ndarray] = {}
-    for k, (path, x) in enumerate(jax.tree_util.tree_leaves_with_path(predictor.state)):
+    leaves = jax.tree.leaves(predictor.state)
+    for parameter, x in zip(_parameters(predictor.state), leaves, strict=True):
         # Batch statistics keep float32: a variance may leave the range of float16.
-        kernel = "kernel" in jax.tree_util.keystr(path)
-        tensors[f"leaf_{k:03d}"] = np.asarray(x).astype(np.float16 if kernel else np.float32)
-        if not np.isfinite(tensors[f"leaf_{k:03d}"]).all():
-            raise WeightsError(
-                f"{name}: {jax.tree_util.keystr(path)} isn't finite in half precision."
-            )
+        kernel = parameter.endswith("kernel")
+        tensors[parameter] = np.asarray(x).astype(np.float16 if kernel else np.float32)
+        if not np.isfinite(tensors[parameter]).all():
+            raise WeightsError(f"{name}: {parameter} isn't finite in half precision.")
     for t, mask in predictor.surface.valid.items():
         tensors[f"valid_{t}"] = np.packbits(np.asarray(mask))
     blob = save_tensors(tensors)
@@ -256,10 +255,16 @@ def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
     network.eval()
     graph, state = nnx.split(network)
     like, structure = jax.tree.flatten(state)
-    leaves = [tensors[f"leaf_{k:03d}"] for k in range(len(like))]
-    for k, (x, y) in enumerate(zip(leaves, like, strict=True)):
-        if x.shape != y.shape:
-            raise WeightsError(f"{weights}: leaf {k} has shape {x.shape}, expected {y.shape}.")
+    leaves = []
+    for parameter, y in zip(_parameters(state), like, strict=True):
+        x = tensors.get(parameter)
+        if x is None or x.shape != y.shape:
+            found = "isn't there" if x is None else f"has shape {x.shape}"
+            raise WeightsError(
+                f"{weights}: {parameter} {found}; {y.shape} is expected. Use the package version"
+                " that the weights came with."
+            )
+        leaves.append(x)
     state = jax.tree.unflatten(
         structure, [jnp.asarray(x.astype(y.dtype)) for x, y in zip(leaves, like, strict=True)]
     )
@@ -276,6 +281,13 @@ def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
     body = load_body()
     surface = make_surface(atlas, body, body.rest_vertices(body.default_shape()), valid)
     return Predictor(atlas, surface, normalisation, state, graph, model)
+
+
+def _parameters(state: Any) -> list[str]:
+    """Names of a network's parameters, ``encoder.layers.0.kernel``, in the order of its leaves."""
+    paths = jax.tree_util.tree_leaves_with_path(state)
+    names = [jax.tree_util.keystr(p, simple=True, separator=".") for p, _ in paths]
+    return [n.removesuffix(".value") for n in names]
 
 
 def _folder(weights: str | pathlib.Path) -> pathlib.Path:

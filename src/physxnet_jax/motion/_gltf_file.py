@@ -14,10 +14,12 @@ from scipy.spatial.transform import Rotation
 from ..errors import MotionError
 from ._gltf_document import MAX_BYTES, parse_gltf
 from ._gltf_track import track_at
-from ._source import MAX_JOINT_FRAMES, nominal_rate
+from ._source import nominal_rate
 
 _MAX_NODES = 20_000
 _MOST_KEYS = 100_000_000
+# Frames times nodes: each is a matrix.
+_MOST_NODE_FRAMES = 1.2e7
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _LENGTHS = {"translation": 3, "rotation": 4, "scale": 3}
@@ -218,7 +220,7 @@ class GltfFile:
             step = min(float(np.median(np.diff(k))) for k in keys)
             rate = min(max(1.0 / max(step, 1e-6), 10.0), 240.0)
             rate = nominal_rate(rate)
-        if (end - start) * rate * len(self.parents) > MAX_JOINT_FRAMES:
+        if (end - start) * rate * len(self.parents) > _MOST_NODE_FRAMES:
             raise self.broken(f"an animation of {end - start:.0f} seconds")
         return start + np.arange(int((end - start) * rate + 1e-3) + 1) / rate, rate
 

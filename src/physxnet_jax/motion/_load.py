@@ -1,5 +1,6 @@
 """One door for every motion: a file of a known format or a built-in clip."""
 
+import dataclasses
 import math
 import pathlib
 from collections.abc import Mapping
@@ -90,9 +91,11 @@ def load_motion(
     if source is not None:
         if isinstance(joint_map, str | pathlib.Path):
             joint_map = read_joint_map(joint_map)
+        if source_fps is not None:
+            source = dataclasses.replace(source, fps=float(source_fps))
         clip = retarget(source, body, joint_map=joint_map, shape=shape)
     assert clip is not None
-    if source_fps is not None:
+    if source_fps is not None and source is None:
         clip = make_motion(clip.rotations, clip.root, source_fps, name=clip.name)
     return clip if fps is None or fps == clip.fps else resample(clip, fps)
 

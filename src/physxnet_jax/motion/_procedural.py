@@ -17,6 +17,7 @@ from ..body import Body, align_global, load_body
 from ..errors import MotionError
 from ._motion import Motion, animate, make_motion
 from ._retarget import foot_heights, stand_on_floor
+from ._source import MAX_JOINT_FRAMES
 
 _X, _Y, _Z = np.eye(3)
 _TAU = 2 * np.pi
@@ -228,6 +229,11 @@ def procedural_clip(
     rate = often * fps
     lead = int(np.ceil(4 * _GLIDE * rate))  # what smoothing reaches beyond both ends
     kept = slice(lead, lead + often * max(1, round(seconds * fps)), often)
+    if (kept.stop + 2 * lead) * len(body.parents) > MAX_JOINT_FRAMES:
+        raise MotionError(
+            f"{seconds:g} s at {fps:g} frames a second are more than are computed at once. Ask for"
+            " fewer."
+        )
     t = np.arange(-lead, kept.stop + lead) / rate
     turns, air = CLIPS[name](t)
     down = {"Left": np.array([0.14, -1.0, 0.02]), "Right": np.array([-0.14, -1.0, 0.02])}

@@ -1,9 +1,15 @@
 """The cloth simulator: scenes of effects, solvers, rollouts. Knows nothing of UV maps."""
 
-from ._advance import advance as advance
+from ._advance import advance as advance, start_state as start_state
 from ._assembly import Assembly as Assembly
 from ._diagnostics import Rollout as Rollout, Status as Status
-from ._effect import Clock as Clock, Effect as Effect, Prepared as Prepared
+from ._effect import (
+    Attached as Attached,
+    Clock as Clock,
+    Effect as Effect,
+    Placed as Placed,
+    Prepared as Prepared,
+)
 from ._implicit import Implicit as Implicit
 from ._rollout import (
     ACCURACY as ACCURACY,

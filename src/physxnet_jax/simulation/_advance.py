@@ -13,6 +13,33 @@ from ._solver import Solver
 from ._state import State, System, place
 
 
+def start_state(
+    system: System,
+    position: Float[Array, "vertices 3 batch"],
+    velocity: Float[Array, "vertices 3 batch"] | None = None,
+    *,
+    solver: Solver,
+    fps: float,
+) -> State:
+    """Cloth from which `advance` goes on; pure and differentiable.
+
+    Args:
+        system: The scene, by `PreparedScene.system` of the solver.
+        position: Cloth [m], garments one after another; people side by side.
+        velocity: Its velocity [m/s]; at rest if omitted.
+        solver: How the cloth will move.
+        fps: Frames a second.
+    """
+    velocity = jnp.zeros_like(position) if velocity is None else velocity
+    return State(
+        position,
+        velocity,
+        solver.remember(velocity, 1.0 / (fps * solver.substeps)),
+        # Filled in here, or a second call of `advance` would be another program to compile.
+        tuple(e.initial(position.shape[2]) for e in system.effects),
+    )
+
+
 @functools.partial(jax.jit, static_argnames=("solver", "fps", "energies"))
 def advance(
     system: System,

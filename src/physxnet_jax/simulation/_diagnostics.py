@@ -69,6 +69,16 @@ class Rollout:
         return self.diagnostics["finite"].astype(bool)
 
     @property
+    def worst(self) -> dict[str, float]:
+        """Each diagnostic where it is worst: the least gap, the most of all else."""
+        of_a_frame = ("finite", "worst_vertex", "milliseconds")
+        return {
+            k: float(np.min(v) if k == "self_gap" else np.max(v))
+            for k, v in self.diagnostics.items()
+            if k not in of_a_frame
+        }
+
+    @property
     def status(self) -> Int[np.ndarray, " frames"]:
         """`Status` bits of each frame."""
         d = self.diagnostics

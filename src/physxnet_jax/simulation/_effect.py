@@ -68,6 +68,8 @@ class Prepared:
     elastic: ClassVar[bool] = False
     # Whether it prescribes where vertices are.
     holds: ClassVar[bool] = False
+    # Which factors of `System.rescaled` it knows.
+    materials: ClassVar[tuple[str, ...]] = ()
 
     @property
     def attached(self) -> Attached | None:
@@ -127,7 +129,7 @@ class Prepared:
         """Its blocks [N/m], made positive semidefinite, in the order of `coupled`."""
         return None
 
-    def constant_stiffness(self) -> Float[np.ndarray, " blocks"] | None:
+    def constant_stiffness(self) -> Float[Array, " blocks"] | None:
         """Blocks that are constant multiples of the identity [N/m], likewise."""
         return None
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ..typing import pytree
+from ._effect import Prepared
 from ._solver import TOLERANCE, Solver, accelerate_all, split, stored_energy
 from ._state import System
 
@@ -180,6 +181,16 @@ class Pattern:
     slots: tuple[Int[Array, " blocks"], ...]
     constant: Float[Array, "vertices k"]
 
+    def rescaled(self, effects: tuple[Prepared, ...]) -> "Pattern":
+        """With the constant blocks of effects whose materials have changed."""
+        elastic = [e for e in effects if e.elastic]
+        fixed = [e.constant_stiffness() for e in elastic]
+        total = jnp.zeros(self.constant.size, self.constant.dtype)
+        for slot, values in zip(self.slots, fixed, strict=True):
+            if values is not None:
+                total = total.at[slot].add(values.astype(total.dtype))
+        return dataclasses.replace(self, constant=total.reshape(self.constant.shape))
+
     def assemble(
         self, elastic: list, x: Array, mass: Array, reach: Array
     ) -> Float[Array, "vertices batch 3 k3"]:
@@ -229,15 +240,6 @@ def _pattern(scene: "PreparedScene") -> Pattern:
         at = order[np.searchsorted(key[order], p[:, 0] * count + p[:, 1])]
         return p[:, 0] * width + place[at]
 
-    constant = np.zeros(count * width)
-    slots = []
-    for e, p in zip(elastic, pairs, strict=True):
-        slots.append(jnp.asarray(slot(p)))
-        fixed = e.constant_stiffness()
-        if fixed is not None:
-            np.add.at(constant, slot(p), np.asarray(fixed))
-    return Pattern(
-        jnp.asarray(neighbour),
-        tuple(slots),
-        jnp.asarray(constant.reshape(count, width).astype(np.float32)),
-    )
+    slots = tuple(jnp.asarray(slot(p)) for p in pairs)
+    nothing = jnp.zeros((count, width), jnp.float32)
+    return Pattern(jnp.asarray(neighbour), slots, nothing).rescaled(scene.effects)

@@ -2,7 +2,6 @@
 
 import contextlib
 import hashlib
-import importlib.metadata
 import pathlib
 import zipfile
 import zlib
@@ -12,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._version import __version__
 from ..errors import SimulationError
 from ..files import whole_file
 
@@ -96,7 +96,7 @@ def fingerprint(*trees: Any) -> str:
     The same in every process: a rollout goes on in another one.
     """
     digest = hashlib.sha256()
-    digest.update(f"{importlib.metadata.version('physxnet-jax')} {jax.__version__}".encode())
+    digest.update(f"{__version__} {jax.__version__}".encode())
     for tree in trees:
         leaves, structure = jax.tree.flatten(tree)
         digest.update(str(structure).encode())

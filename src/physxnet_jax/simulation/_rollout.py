@@ -1,6 +1,5 @@
 """Rollouts: a scene through a motion, from rest, frame by frame."""
 
-import dataclasses
 import pathlib
 from collections.abc import Callable
 
@@ -12,13 +11,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from ..body import Body
 from ..errors import SimulationError
 from ..motion import Motion, animate
-from ._advance import advance
+from ._advance import advance, start_state
 from ._assembly import float32
 from ._diagnostics import Rollout
 from ._resume import Resume, fingerprint
 from ._scene import PreparedScene, Scene, prepare_scene
 from ._solver import Solver
-from ._state import State
 from ._xpbd import XPBD
 
 # Frames compiled together: clips of any length are cut into blocks of this many.
@@ -189,13 +187,7 @@ def _roll(
         for lead in leads
     ]
     x = jnp.stack(start, axis=2).astype(solver.precision)
-    state = State(x, jnp.zeros_like(x))
-    state = dataclasses.replace(
-        state,
-        memory=solver.remember(state.velocity, 1.0 / (fps * solver.substeps)),
-        # Filled in here, or the second block would be another program to compile.
-        kept=tuple(e.initial(len(motions)) for e in system.effects),
-    )
+    state = start_state(system, x, solver=solver, fps=fps)
     # Time zero is the clip's first frame, whatever the lead-in's length.
     began = -(skipped - 1) / fps
     store = None

@@ -117,6 +117,7 @@ def cast(tree: Any, precision: str) -> Any:
     dtype = jnp.dtype(precision)
 
     def one(x: Any) -> Any:
+        x = jnp.asarray(x)
         return x.astype(dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x
 
     return jax.tree.map(one, tree)

@@ -61,7 +61,7 @@ class System:
                 (stiffnesses), ``friction`` (on the skin).
 
         Raises:
-            SimulationError: Another parameter.
+            SimulationError: Another parameter, or one that no effect of the scene has.
 
         Example:
             ``jax.grad(lambda k: loss(system.rescaled(bend=k)))``
@@ -72,8 +72,16 @@ class System:
                 f"No parameter {', '.join(sorted(set(factors) - names))}; there are"
                 f" {', '.join(sorted(names))}."
             )
+        for name in factors:
+            if not any(name in e.materials for e in self.effects):
+                raise SimulationError(
+                    f"No effect of this scene has {name}, so a factor of it changes nothing. Leave"
+                    " it out, or put the effect in."
+                )
         effects = tuple(e.rescaled(factors) for e in self.effects)
-        return dataclasses.replace(self, effects=effects)
+        # What a solver keeps of materials changes with them.
+        extra = self.extra.rescaled(effects) if hasattr(self.extra, "rescaled") else self.extra
+        return dataclasses.replace(self, effects=effects, extra=extra)
 
 
 def place(

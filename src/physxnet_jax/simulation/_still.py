@@ -5,11 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._advance import advance
+from ._advance import advance, start_state
 from ._diagnostics import Rollout
 from ._scene import PreparedScene, cast
 from ._solver import Solver
-from ._state import State
 
 
 def simulate_still(
@@ -49,16 +48,13 @@ def simulate_still(
 
         x = assembly.rest if start is None else np.asarray(start, np.float64)
         v = np.zeros_like(x) if velocity is None else np.asarray(velocity, np.float64)
-        state = State(device(x + np.asarray(shift))[:, :, None], device(v)[:, :, None])
-        state = State(
-            state.position,
-            state.velocity,
-            solver.remember(state.velocity, 1.0 / (fps * solver.substeps)),
-        )
+        system = scene.system(solver)
+        place = device(x + np.asarray(shift))[:, :, None]
+        state = start_state(system, place, device(v)[:, :, None], solver=solver, fps=fps)
         pose = jnp.repeat(cast(body.a_pose(), dtype)[None, None], frames + 1, axis=0)
         root = np.repeat((heads[:1] + np.asarray(shift))[None], frames + 1, axis=0)
         _, moved, info = advance(
-            scene.system(solver),
+            system,
             state,
             pose,
             device(root),

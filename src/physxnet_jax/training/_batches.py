@@ -233,7 +233,7 @@ def measure_normalisation(
     """
     pick = np.random.default_rng(seed).choice(len(frames), min(samples, len(frames)), False)
     look = jax.jit(clip_features, static_argnames=("fps", "inputs"))
-    # Lengths don't depend on the frame they are told in.
+    # World axes, whatever the network is told in: close enough for a scale.
     seen = dataclasses.replace(PAPER, frames=1)
     rows = [
         np.abs(

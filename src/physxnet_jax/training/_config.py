@@ -40,7 +40,8 @@ class TrainConfig:
         seed: Of everything random.
         precision: Of the network's arithmetic; parameters and losses stay float32.
         validation: Names of training actions that are kept from training and measured
-            instead; the weights that did best on them are the result.
+            instead; the weights that did best on them are the result. A set that mixes
+            bodies (`DatasetConfig.upper_from`) has their upper bodies under other names.
         validate_every: Steps between such measurements.
         patience: Stop after this many measurements without a better one.
         checkpoint_every: Steps between checkpoints.

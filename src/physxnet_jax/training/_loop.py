@@ -1,10 +1,12 @@
 """The training loop: resumable, logged, and ending in a predictor."""
 
+import dataclasses
 import itertools
 import json
 import pathlib
 import time
 from collections.abc import Callable, Sequence as Items
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -201,7 +203,9 @@ def _validate(
 def _same_run(path: pathlib.Path, text: str) -> None:
     """Notes what a run is, or refuses to go on with another one in its folder."""
     if path.is_file():
-        before, now = json.loads(path.read_text()), json.loads(text)
+        # What a run begun by an earlier version doesn't say was as it is by default.
+        before = _filled(json.loads(path.read_text()), dataclasses.asdict(TrainConfig()))
+        now = json.loads(text)
         changed = [k for k in now if before.get(k) != now[k]]
         if changed:
             raise PhysXNetError(
@@ -211,6 +215,17 @@ def _same_run(path: pathlib.Path, text: str) -> None:
         return
     with whole_file(path) as part:
         part.write_text(text)
+
+
+def _filled(told: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
+    """Settings, with what isn't among them as it is by default."""
+    told = {**{k: v for k, v in usual.items() if k not in told}, **told}
+    inner = {
+        k: _filled(v, usual[k])
+        for k, v in told.items()
+        if isinstance(v, dict) and isinstance(usual.get(k), dict)
+    }
+    return json.loads(json.dumps({**told, **inner}))
 
 
 def make_predictor(

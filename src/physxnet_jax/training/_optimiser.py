@@ -29,7 +29,9 @@ def make_optimiser(
     def schedule(peak: float) -> optax.Schedule:
         if config.schedule == "constant":
             return optax.constant_schedule(peak)
-        return optax.warmup_cosine_decay_schedule(0.0, peak, max(steps // 50, 1), max(steps, 2))
+        warm = max(steps // 50, 1)
+        # From zero the first step would change nothing.
+        return optax.warmup_cosine_decay_schedule(peak / warm, peak, warm, max(steps, 2))
 
     inner = optax.adam(schedule(rate), b1=config.momentum)
     if kernel_rate is not None:

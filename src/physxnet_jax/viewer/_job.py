@@ -111,7 +111,10 @@ class Shown:
 
     def maps(self, frame: int, templates: tuple[str, ...]) -> dict[str, np.ndarray]:
         """The network's maps of a frame, as pictures."""
-        predictor = _predictor(self.choice.weights, self.choice.shape)
+        choice = self.choice
+        predictor = _predictor(
+            choice.weights, choice.shape, str(read_card(choice.weights)["sha256"])
+        )
         window = predictor.config.inputs.window
         rows = np.maximum(np.arange(frame + 1 - window, frame + 1), 0)
         return frame_maps(
@@ -182,7 +185,7 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
             fps=choice.fps,
             shape=shape,
             include_body=False,
-            resolve=choice.push_out,
+            push_out=choice.push_out,
             progress=progress,
         )
         garments = dressed.garments
@@ -270,8 +273,10 @@ def _shape(choice: Choice) -> Any | None:
 
 
 @functools.lru_cache(4)
-def _predictor(weights: str, shape: tuple[tuple[str, float], ...]) -> Predictor:
+def _predictor(weights: str, shape: tuple[tuple[str, float], ...], sha256: str) -> Predictor:
+    """Kept as long as the weights of that name stay what they are."""
+    del sha256
     body = load_body()
     params = body.shape(**dict(shape)) if shape else None
     rest = body.rest_vertices(body.default_shape() if params is None else params)
-    return fit_surface(load_predictor(weights), body, rest, params)
+    return fit_surface(load_predictor(weights), body, rest)

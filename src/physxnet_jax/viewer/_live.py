@@ -45,7 +45,7 @@ class Live:
         push_out: bool = True,
     ) -> None:
         self._motion = motion
-        self._dresser = make_dresser(wear, weights=weights, shape=shape, resolve=push_out)
+        self._dresser = make_dresser(wear, weights=weights, shape=shape, push_out=push_out)
         self._step = _step(motion.fps)
         self._start = jax.jit(start_clothing)
         self._times: collections.deque[float] = collections.deque(maxlen=_RECENT)

@@ -107,6 +107,7 @@ class Viewer:
             motion=motion,
             source_fps=first.source_fps if known else None,
             skeleton=first.skeleton if known else None,
+            joint_map=first.joint_map if known else None,
             wear=tuple(
                 str(self._files.get(name, name)) for name, box in self._worn.items() if box.value
             ),

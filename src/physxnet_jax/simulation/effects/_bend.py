@@ -59,6 +59,7 @@ class _Hinges:
 @dataclasses.dataclass(frozen=True)
 class _Bend(Prepared):
     elastic = True
+    materials = ("bend",)
     hinges: _Hinges
     sheaves: tuple[Sheaf, ...]
 
@@ -107,8 +108,8 @@ class _Bend(Prepared):
     def coupled(self) -> Int[np.ndarray, "blocks 2"]:
         return corner_pairs(self.hinges.index)
 
-    def constant_stiffness(self) -> Float[np.ndarray, " blocks"]:
+    def constant_stiffness(self) -> Float[Array, " blocks"]:
         h = self.hinges
-        c = [np.asarray(x)[:, 0, 0] for x in h.coefficient]
-        k = 1.0 / np.asarray(h.compliance)[:, 0, 0]
-        return np.concatenate([k * a * b for a in c for b in c])
+        c = [x[:, 0, 0] for x in h.coefficient]
+        k = 1.0 / h.compliance[:, 0, 0]
+        return jnp.concatenate([k * a * b for a in c for b in c])

@@ -230,6 +230,8 @@ class _Contact(Prepared):
     def attached(self) -> Attached:
         return self.skin
 
+    materials = ("friction",)
+
     def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
         if "friction" not in factors:
             return self

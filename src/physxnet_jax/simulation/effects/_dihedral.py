@@ -40,6 +40,8 @@ class Dihedral(Effect):
 class _Dihedral(Coloured):
     group: Group
 
+    materials = ("bend",)
+
     def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
         if "bend" not in factors:
             return self

@@ -1,6 +1,7 @@
 """Membrane: triangles resist stretch along warp and weft, and shear between them."""
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
@@ -93,6 +94,14 @@ def rest_frames(
 class _Membrane(Coloured):
     group: Group
     softer: float = dataclasses.field(metadata={"static": True})
+    materials = ("stretch",)
+
+    def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
+        if "stretch" not in factors:
+            return self
+        law = dict(self.group.law)
+        law |= {k: law[k] / factors["stretch"] for k in ("warp", "weft", "shear")}
+        return dataclasses.replace(self, group=dataclasses.replace(self.group, law=law))
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
         def direction(one: str, two: str, compliance: str) -> Any:

@@ -33,8 +33,9 @@ class Seam(Effect):
         """Colours the stitches so that a Gauss-Seidel sweep runs colour by colour."""
         pairs = np.asarray(self.stitches, np.int64).reshape(-1, 2)
         if pairs.size and not (0 <= pairs.min() and pairs.max() < len(assembly.rest)):
+            wrong = int(pairs.min() if pairs.min() < 0 else pairs.max())
             raise SimulationError(
-                f"A stitch names vertex {int(pairs.max())}; the scene has {len(assembly.rest)}."
+                f"A stitch names vertex {wrong}; the scene has {len(assembly.rest)}, from 0."
             )
         law = {"compliance": np.full(len(pairs), 1.0 / self.stiffness)}
         return _Seam(colour_group(pairs, np.asarray(inverse_mass), law))

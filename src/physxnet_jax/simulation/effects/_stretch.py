@@ -80,6 +80,8 @@ class _Stretch(Prepared):
     sheaves: tuple[Sheaf, ...]
     softer: float = dataclasses.field(metadata={"static": True})
 
+    materials = ("stretch",)
+
     def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
         if "stretch" not in factors:
             return self
