@@ -16,6 +16,7 @@ motion = px.load_motion("walk", fps=30)
 # The stream is used up: its memory serves the next one.
 step = jax.jit(functools.partial(px.clothe_frame, fps=30.0), donate_argnums=1)
 
+# Who comes in moving would be told by the first few poses; here the first one is all there is.
 stream = px.start_clothing(dresser, motion.rotations[0], motion.root[0])
 times = []
 for rotations, root in zip(motion.rotations, motion.root, strict=True):

@@ -1,5 +1,8 @@
 """Exceptions whose text says what was got, what was expected and how to fix it."""
 
+import math
+import numbers
+
 
 class PhysXNetError(Exception):
     """Base of every error this package raises on purpose."""
@@ -49,3 +52,36 @@ __all__ = [
     "SimulationError",
     "WeightsError",
 ]
+
+
+def check_numbers(owner: object, *names: str, zero: bool = False) -> None:
+    """Fails unless attributes of settings are finite and positive; None is left out.
+
+    Args:
+        owner: The settings.
+        *names: Of the attributes.
+        zero: Whether zero will do.
+
+    Raises:
+        ValueError: One isn't; attribute and value are named.
+    """
+    for name in names:
+        value = getattr(owner, name)
+        if value is None:
+            continue
+        number = isinstance(value, numbers.Real) and math.isfinite(value)
+        if not number or value < 0 or (value == 0 and not zero):
+            wanted = "a number from 0 up" if zero else "a positive number"
+            raise ValueError(f"{name} is {value}, expected {wanted}")
+
+
+def check_counts(owner: object, *names: str) -> None:
+    """Fails unless attributes of settings are whole numbers from 1 up.
+
+    Raises:
+        ValueError: One isn't; attribute and value are named.
+    """
+    for name in names:
+        value = getattr(owner, name)
+        if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
+            raise ValueError(f"{name} is {value}, expected a whole number from 1 up")

@@ -24,6 +24,7 @@ from physxnet_jax.dressing._dresser import _check_pose
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.io import load_predictor
 from physxnet_jax.models import PAPER, fold_batch_norm
+from physxnet_jax.motion import load_motion
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def test_the_layer_gives_what_dress_gives(whole, motion):
 def test_a_frame_at_a_time_is_the_clip(dresser, whole, motion):
     step = jax.jit(clothe_frame, static_argnames="fps", donate_argnames="stream")
     rotations, root = motion
-    stream = start_clothing(dresser, rotations[0], root[0])
+    stream = start_clothing(dresser, rotations, root)
     for k in range(len(rotations)):
         stream, cloth = step(dresser, stream, rotations[k], root[k], fps=30.0)
         np.testing.assert_allclose(
@@ -291,3 +292,30 @@ print(len(jax.devices()), "devices")
         timeout=600,
     )
     assert done.returncode == 0 and "2 devices" in done.stdout, done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("fps", [30.0, 120.0])
+def test_a_clip_begins_without_a_jump(fps):
+    """Cloth accelerates in the first frames as in those after, however many there are a second."""
+    walk = load_motion("walk", fps=fps)
+    clip = dataclasses.replace(walk, rotations=walk.rotations[15:47], root=walk.root[15:47])
+    dresser = make_dresser(["bottom"], weights="nano", push_out=False)
+    worn = jax.jit(clothe, static_argnames="fps")(dresser, clip.rotations, clip.root, fps=fps)
+
+    def jumps(x):
+        second = np.linalg.norm(np.diff(np.asarray(x), n=2, axis=0), axis=2)
+        return np.quantile(second, 0.99, axis=1)
+
+    now = jumps(worn["bottom"])
+    assert now[:4].max() < 2.0 * now[4:].max()
+    again = dress(clip, ["bottom"], weights="nano", push_out=False, fps=fps, include_body=False)
+    np.testing.assert_allclose(again.garments[0].positions, worn["bottom"], atol=1e-5)
+    if fps > 100:
+        # The control: somebody who stood still until then is thrown into motion.
+        stream = start_clothing(dresser, clip.rotations[0], clip.root[0])
+        step = jax.jit(clothe_frame, static_argnames="fps")
+        thrown = []
+        for q, p in zip(clip.rotations[:8], clip.root[:8]):
+            stream, cloth = step(dresser, stream, q, p, fps=fps)
+            thrown.append(cloth["bottom"])
+        assert jumps(thrown)[:4].max() > 5.0 * now[4:].max()

@@ -137,11 +137,14 @@ def test_a_spoiled_frame_is_seen_in_its_window_alone(dresser, judge, motion):
     """The frames whose window holds it are NaN and say so; all others are untouched."""
     q, p = motion
     _, clean, _, _ = judge(q, p)
-    _, out, _, _ = judge(q, p.at[1].set(jnp.nan))
     window = dresser.predictor.config.inputs.window
     assert window == 5
     seen = np.arange(FRAMES)
-    spoiled = (seen >= 1) & (seen < 1 + window)
+    # What was before the first frame is told from those after it: nothing gets in by that way.
+    _, out, _, _ = judge(q, p.at[1].set(jnp.nan))
+    np.testing.assert_array_equal(np.asarray(out["ok"]), (seen < 1) | (seen >= 1 + window))
+    _, out, _, _ = judge(q, p.at[window].set(jnp.nan))
+    spoiled = (seen >= window) & (seen < 2 * window)
     np.testing.assert_array_equal(np.asarray(out.pop("ok")), ~spoiled)
     for name, x in out.items():
         whole = np.isfinite(np.asarray(x)).all(axis=(1, 2))

@@ -132,7 +132,7 @@ def test_of_two_alike_the_second_stays_over_the_first_live_and_in_clips():
         height, beside, _ = layer_height(layer, inner, outer)
         on = np.asarray(beside) < 0.005
         assert on.mean() > 0.9 and np.quantile(height[on], 0.01) > 0.002
-    stream = start_clothing(dresser, q[0], p[0])
+    stream = start_clothing(dresser, q, p)
     step = jax.jit(clothe_frame, static_argnames="fps")
     for k in range(3):
         stream, now = step(dresser, stream, q[k], p[k], fps=30.0)

@@ -18,6 +18,7 @@ from physxnet_jax.motion import (
     load_motion,
     mirror_joints,
     mirrored,
+    poses_before,
     with_upper_body,
 )
 
@@ -128,3 +129,25 @@ def test_another_upper_body_leaves_the_legs_and_plays_to_and_fro():
     still = dataclasses.replace(body, joint_names=tuple(f"J{k}" for k in range(len(names))))
     with pytest.raises(MotionError, match="no spine"):
         with_upper_body(still, walk, punch)
+
+
+def test_what_was_before_a_clip_goes_on_into_it():
+    clip = load_motion("walk", fps=60.0)
+    q, p = poses_before(clip.rotations, clip.root, 5)
+    assert q.shape == (5, 31, 4) and p.shape == (5, 3)
+    np.testing.assert_allclose(
+        p[::-1] + clip.root[1:6], 2 * np.tile(clip.root[0], (5, 1)), atol=1e-6
+    )
+    # About the first pose every joint turned as far before as it does after.
+    turns = [
+        Rotation.from_quat(np.asarray(x), scalar_first=True)
+        for x in (q[-1], clip.rotations[0], clip.rotations[1])
+    ]
+    np.testing.assert_allclose(
+        (turns[0].inv() * turns[1]).as_matrix(), (turns[1].inv() * turns[2]).as_matrix(), atol=1e-5
+    )
+    one = poses_before(clip.rotations[:1], clip.root[:1], 3)
+    np.testing.assert_allclose(one[1], np.tile(clip.root[:1], (3, 1)), atol=1e-6)
+    assert np.abs(np.abs(np.sum(np.asarray(one[0] * clip.rotations[:1]), axis=-1)) - 1).max() < 1e-5
+    spoiled = poses_before(clip.rotations.at[2].set(np.nan), clip.root, 5)
+    assert np.isfinite(np.asarray(spoiled[0])).all() and np.isfinite(np.asarray(spoiled[1])).all()

@@ -65,15 +65,21 @@ def predict_clip(
     layers: Sequence[Layer],
     world: np.ndarray,
     shift: np.ndarray,
+    before: tuple[np.ndarray, np.ndarray],
     fps: float,
     pushed: bool,
     stages: list[Stage],
     progress: Callable[[str, int, int], None] | None,
 ) -> tuple[dict[str, np.ndarray], dict[str, float]]:
-    """Positions of each garment [m], and the share of its vertices inside before push-out."""
+    """Positions of each garment [m], and the share of its vertices inside before push-out.
+
+    ``before`` are the joints' transforms in `lead_frames` frames before the clip.
+    """
     lead = lead_frames(predictor)
+    if lead:
+        world, shift = (np.concatenate(pair) for pair in zip(before, (world, shift), strict=True))
     name = "network" if predictor is not None else "skinning"
-    frames = len(world)
+    frames = len(world) - lead
     blocks, times = [], []
     for start in range(0, frames, BLOCK):
         began = time.perf_counter()
@@ -82,8 +88,8 @@ def predict_clip(
             tuple(wearables),
             tuple(patches),
             tuple(layers),
-            jnp.asarray(padded_block(world, start, lead)),
-            jnp.asarray(padded_block(shift, start, lead)),
+            jnp.asarray(padded_block(world, start + lead, lead)),
+            jnp.asarray(padded_block(shift, start + lead, lead)),
             fps,
             pushed,
         )

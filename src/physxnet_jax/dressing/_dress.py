@@ -15,13 +15,10 @@ from ..garment import Garment
 from ..geometry import Smoothing, make_springs
 from ..io import DEFAULT, AnimatedMesh, load_predictor
 from ..models import Predictor, Wearable, fold_batch_norm, make_surface, make_wearable
-from ..motion import (
-    Motion,
-    clip_transforms,
-)
+from ..motion import Motion, before_transforms, clip_transforms
 from ..simulation import ACCURACY
 from ..uv import Binding, Transference, bind
-from ._blocks import inside_share, lift_clip, predict_clip, simulate_clip
+from ._blocks import inside_share, lead_frames, lift_clip, predict_clip, simulate_clip
 from ._character import (
     Character,
     clear_of_character,
@@ -174,6 +171,7 @@ def dress(
         positions = simulate_clip(garments, clip, body, shape, accuracy, stages, progress)
         inside_raw = None
     else:
+        before = before_transforms(body, rest, clip, lead_frames(predictor))
         positions, inside_raw = predict_clip(
             predictor,
             wearables,
@@ -181,6 +179,7 @@ def dress(
             layers,
             world,
             shift,
+            before,
             clip.fps,
             push_out,
             stages,

@@ -20,10 +20,10 @@ from ..models import (
     Wearable,
     at_precision,
     dress_frames,
-    pad_clip,
     start_stream,
     stream_frame,
 )
+from ..motion import poses_before
 from ..typing import pytree
 from ._dress import as_on, bound_wearable, fit_surface
 from ._layers import Layer, lift_layers, lift_off, make_layers
@@ -204,7 +204,8 @@ def clothe(
 ) -> Clothed:
     """Clothes in successive frames; pure, for `jax.jit`, `jax.vmap` and `jax.grad`.
 
-    Before the first frame the person is taken to have stood still.
+    Before the first frame the person is taken to have moved as the clip begins, see
+    `poses_before`.
 
     Args:
         dresser: From `make_dresser`.
@@ -231,13 +232,12 @@ def clothe(
     _check_pose(dresser.body, rotations, root, ("frames",))
     if rotations.shape[0] == 0:
         raise ValueError("a clip of no frames; clothe takes one or more.")
-    world, shift = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(
-        rotations, root
-    )
-    inputs = dresser.predictor.config.inputs
-    raw = dress_frames(
-        dresser.predictor, dresser.wearables, pad_clip(world, inputs), pad_clip(shift, inputs), fps
-    )
+    lead = dresser.predictor.config.inputs.window - 1
+    before = poses_before(rotations, root, lead)
+    joints = (jnp.concatenate(pair) for pair in zip(before, (rotations, root), strict=True))
+    led = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*joints)
+    raw = dress_frames(dresser.predictor, dresser.wearables, *led, fps)
+    world, shift = (x[lead:] for x in led)
     if dresser.push_out:
         raw = lift_layers(
             dresser.layers,
@@ -250,20 +250,30 @@ def clothe(
 
 
 def start_clothing(
-    dresser: Dresser, rotations: Float[Array, "joints 4"], root: Float[Array, "3"]
+    dresser: Dresser,
+    rotations: Float[Array, "joints 4"] | Float[Array, "frames joints 4"],
+    root: Float[Array, "3"] | Float[Array, "frames 3"],
 ) -> Stream:
-    """The state from which `clothe_frame` goes on: a person who stood still until now.
+    """The state from which `clothe_frame` goes on.
 
     Args:
         dresser: From `make_dresser`.
-        rotations: Joint rotations of the first frame.
-        root: Position of the root joint [m].
+        rotations: Joint rotations of the first frame, of a person who stood still until
+            now; or of the first frames, where they are known: the person then moved as
+            they begin, as in `clothe`. As many as a network sees before one are enough.
+        root: Position of the root joint [m], likewise.
+
+    Returns:
+        The stream before the first frame.
 
     Raises:
         ValueError: Of another skeleton than the body's.
     """
-    _check_pose(dresser.body, rotations, root, ())
-    world, shift = dresser.body.transforms(dresser.rest, rotations, root)
+    if rotations.ndim == 2:
+        rotations, root = rotations[None], root[None]
+    _check_pose(dresser.body, rotations, root, ("frames",))
+    before = poses_before(rotations, root, dresser.predictor.config.inputs.window - 1)
+    world, shift = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*before)
     return start_stream(dresser.predictor, world, shift)
 
 

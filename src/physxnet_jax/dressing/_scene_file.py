@@ -12,7 +12,7 @@ from ..body import load_body
 from ..errors import FormatError
 from ..garment import FABRICS, Garment
 from ..motion import Motion
-from ..simulation import ACCURACY, EFFECTS, Effect, Scene, standard_effects
+from ..simulation import ACCURACY, EFFECTS, Air, Damping, Effect, Scene, standard_effects
 from ._layers import inside_out
 from ._meshes import worn_garments
 from ._wanted_clip import wanted_clip
@@ -100,9 +100,12 @@ def make_scene(
     )
     garments, notes = worn_garments(wear, body)
     if fabric is not None:
-        garments = [dataclasses.replace(g, fabric=FABRICS[fabric]) for g in garments]
+        garments = [made_of(g, fabric) for g in garments]
     garments = inside_out(garments)
     acting = standard_effects(len(garments)) if effects is None else tuple(effects)
+    if effects is None and any(isinstance(e, Air) for e in also):
+        # Damping stands for still air: with both it would be there twice.
+        acting = tuple(e for e in acting if not isinstance(e, Damping))
     scene = Scene(tuple(garments), _merged(acting, also), body, shape)
     return SceneFile(scene, clip, accuracy, notes)
 
@@ -172,8 +175,7 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
             raise FormatError(f"{path}: no fabric '{g['fabric']}'; there are {', '.join(FABRICS)}.")
     worn, notes = worn_garments([_beside(path, g["file"]) for g in words], load_body())
     garments = [
-        dataclasses.replace(w, fabric=FABRICS[g["fabric"]]) if "fabric" in g else w
-        for w, g in zip(worn, words, strict=True)
+        made_of(w, g["fabric"]) if "fabric" in g else w for w, g in zip(worn, words, strict=True)
     ]
     made = make_scene(
         _beside(path, text["motion"]),
@@ -189,6 +191,17 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         also=_effects(path, text.get("also", {})),
     )
     return dataclasses.replace(made, notes=notes)
+
+
+def made_of(garment: Garment, fabric: str) -> Garment:
+    """A garment of another fabric, by name.
+
+    It keeps at least the distance from the skin that it was made for: that one depends on
+    how coarse its mesh is and on what it lies over, not on the cloth alone.
+    """
+    cloth = FABRICS[fabric]
+    thickness = max(cloth.thickness, garment.fabric.thickness)
+    return dataclasses.replace(garment, fabric=dataclasses.replace(cloth, thickness=thickness))
 
 
 def _beside(path: pathlib.Path, word: str) -> str | pathlib.Path:

@@ -1,6 +1,7 @@
 """What each effect of a scene costs, and what it changes."""
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable, Sequence
 
@@ -11,6 +12,7 @@ from ..motion import Motion
 from ..simulation import (
     Air,
     BodyContact,
+    Damping,
     Effect,
     LayerContact,
     PreparedScene,
@@ -162,6 +164,9 @@ def recommend_effects(
             len(scene.effects),
         )
         effects = (*scene.effects[:at], e, *scene.effects[at:])
+        if isinstance(e, Air):
+            # Damping stands for it.
+            effects = tuple(x for x in effects if not isinstance(x, Damping))
         row, rollout = _measure(
             dataclasses.replace(scene, effects=effects), motion, solver, whole, ""
         )
@@ -175,7 +180,10 @@ def recommend_effects(
             least = float(rollout.diagnostics["self_gap"].min())
             if least >= e.gap:
                 needed = False
-                said = f"Cloth never comes nearer to itself than {1e3 * min(least, 1.0):.1f} mm."
+                near = "as near to itself as is watched"
+                if math.isfinite(least):
+                    near = f"nearer to itself than {1e3 * least:.1f} mm"
+                said = f"Cloth never comes {near}."
         out.append(Advice(name, needed, said))
         advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
         if progress is not None:

@@ -6,6 +6,7 @@ from typing import Literal
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ..errors import check_numbers
 from ..geometry import Polygons, TriMesh
 from ..typing import pytree
 
@@ -37,6 +38,10 @@ class Fabric:
     warp: float | None = None
     weft: float | None = None
     shear: float | None = None
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "density", "stretch", "warp", "weft", "shear")
+        check_numbers(self, "bend", "thickness", "friction", zero=True)
 
     @property
     def membrane(self) -> tuple[float, float, float]:

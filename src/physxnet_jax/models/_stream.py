@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -28,20 +29,24 @@ class Stream:
 
 def start_stream(
     predictor: Predictor,
-    rotations: Float[Array, "joints 3 3"],
-    translations: Float[Array, "joints 3"],
+    rotations: Float[Array, "lead joints 3 3"] | Float[Array, "joints 3 3"],
+    translations: Float[Array, "lead joints 3"] | Float[Array, "joints 3"],
 ) -> Stream:
-    """A stream of a person who has stood in this pose until now.
+    """A stream of a person who has done this until now.
 
     Args:
         predictor: The network.
-        rotations: World rotations of joints in the first frame.
+        rotations: World rotations of joints in the ``config.inputs.window - 1`` frames
+            before the first, oldest first; or in one pose, in which the person stood.
         translations: World translations of joints [m], likewise.
     """
     surface = predictor.surface
-    points, _ = skin_points(surface.rest, surface.weights, rotations, translations)
     lead = predictor.config.inputs.window - 1
-    return Stream(jnp.broadcast_to(points, (lead, *points.shape)))
+    if rotations.ndim == 3:
+        rotations = jnp.broadcast_to(rotations, (lead, *rotations.shape))
+        translations = jnp.broadcast_to(translations, (lead, *translations.shape))
+    points = jax.vmap(lambda r, t: skin_points(surface.rest, surface.weights, r, t)[0])
+    return Stream(points(rotations, translations))
 
 
 def stream_frame(

@@ -36,8 +36,10 @@ from ._source import (
 )
 from ._transforms import (
     BLOCK as BLOCK,
+    before_transforms as before_transforms,
     clip_transforms as clip_transforms,
     padded_block as padded_block,
+    poses_before as poses_before,
 )
 from ._variants import (
     at_speed as at_speed,

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..errors import check_counts, check_numbers
 from ..typing import pytree
 from ._effect import Prepared
 from ._solver import TOLERANCE, Solver, accelerate_all, split, stored_energy
@@ -47,8 +48,8 @@ class Implicit(Solver):
         super().__post_init__()
         if self.order not in (1, 2):
             raise ValueError(f"order {self.order} is neither 1 (backward Euler) nor 2 (BDF2).")
-        if self.newton < 1 or self.iterations < 1:
-            raise ValueError("newton and iterations are at least 1.")
+        check_counts(self, "newton", "iterations")
+        check_numbers(self, "tolerance")
 
     def prepare(self, scene: "PreparedScene") -> "Pattern":
         """The sparsity pattern of the scene's elastic effects."""

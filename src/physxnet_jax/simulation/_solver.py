@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ..errors import check_counts
 from ._effect import Prepared
 from ._state import System
 
@@ -34,7 +35,8 @@ class Solver(abc.ABC):
     precision: str = "float32"
 
     def __post_init__(self) -> None:
-        if self.queries < 1 or self.substeps < 1 or self.substeps % self.queries:
+        check_counts(self, "substeps", "queries")
+        if self.substeps % self.queries:
             raise ValueError(
                 f"substeps {self.substeps} must be a positive multiple of queries {self.queries}."
             )

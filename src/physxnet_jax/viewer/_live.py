@@ -62,8 +62,10 @@ class Live:
     def frame(self, index: int) -> dict[str, Float[np.ndarray, "vertices 3"]]:
         """Vertices of every garment in a frame of the clip [m]."""
         if index != self._next:
-            first = max(index + 1 - self._dresser.predictor.config.inputs.window, 0)
-            self._stream = self._start(self._dresser, *self._pose(first))
+            window = self._dresser.predictor.config.inputs.window
+            first = max(index + 1 - window, 0)
+            rows = np.minimum(np.arange(first, first + window), self._motion.num_frames - 1)
+            self._stream = self._start(self._dresser, *self._pose(rows))
             for earlier in range(first, index):
                 self._stream, _ = self._step(self._dresser, self._stream, *self._pose(earlier))
         began = time.perf_counter()
@@ -73,7 +75,7 @@ class Live:
         self._next = index + 1
         return found
 
-    def _pose(self, index: int) -> tuple[Array, Array]:
+    def _pose(self, index: int | np.ndarray) -> tuple[Array, Array]:
         return self._motion.rotations[index], self._motion.root[index]
 
 

@@ -7,11 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
 
-from ...geometry import vertex_faces
+from ...body import NUM_BODY_VERTICES, triangulate
+from ...errors import check_numbers
+from ...geometry import spread_points, vertex_faces, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Clock, Effect, Prepared
+from .._effect import Attached, Clock, Effect, Placed, Prepared
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +23,10 @@ class Air(Effect):
 
     ``u_n`` is its part along the cloth's normal, ``u_t`` the rest. Normals and the
     wind's field are those at the start of a block. The step is implicit in ``|u|``, so
-    that no wind is strong enough to make it unstable.
+    that no wind is strong enough to make it unstable. Cloth near skin that faces away from
+    the wind lies in the body's lee: there the mean wind is weaker, and dies away towards the
+    skin. That is no flow around a body, but without it the lee side is blown off the skin as
+    hard as the other is pressed on.
 
     Attributes:
         wind: Mean wind [m/s].
@@ -32,6 +38,8 @@ class Air(Effect):
         density: Of air [kg/m^3].
         normal: Drag coefficient across the cloth [1].
         tangent: Along it [1].
+        shelter: Share of the mean wind that is kept off where skin faces straight away
+            from it [1].
 
     References:
         Flat plate across the flow: Hoerner, Fluid-dynamic drag (1965), chapter 3;
@@ -47,6 +55,17 @@ class Air(Effect):
     density: float = 1.2
     normal: float = 1.2
     tangent: float = 0.02
+    shelter: float = 0.9
+
+    def __post_init__(self) -> None:
+        if len(self.wind) != 3 or not np.isfinite(self.wind).all():
+            raise ValueError(f"wind is {self.wind}, expected three finite numbers [m/s]")
+        check_numbers(self, "period", "eddy")
+        check_numbers(
+            self, "gust", "turbulence", "density", "normal", "tangent", "shelter", zero=True
+        )
+        if self.shelter > 1.0:
+            raise ValueError(f"shelter is {self.shelter}, expected a share from 0 to 1")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Tables of faces around vertices; modes of turbulence if there is any."""
@@ -77,11 +96,54 @@ class Air(Effect):
             float32(once)[:, :, None, None],
             float32((0.5 * self.density * share / assembly.mass)[:, None, None]),
             modes,
+            self._lee(assembly),
             self,
         )
 
+    def _lee(self, assembly: Assembly) -> "_Lee | None":
+        """Skin that may keep the wind off each vertex; nothing for cloth that isn't worn."""
+        if not (any(self.wind) and self.shelter > 0):
+            return None
+        skin = assembly.rest_body[:NUM_BODY_VERTICES]
+        some = spread_points(skin, _SPACING)
+        far, near = KDTree(skin[some]).query(assembly.rest, k=_NEAR)
+        if far.min() > _REACH:
+            return None
+        used, local = np.unique(near, return_inverse=True)
+        rows = some[used]
+        faces = jnp.asarray(np.asarray(triangulate(assembly.body.quads)))
+        attached = Attached(
+            float32(skin[rows]),
+            vertex_normals(float32(skin), faces)[jnp.asarray(rows)],
+            assembly.body.weights[jnp.asarray(rows)],
+        )
+        return _Lee(attached, jnp.asarray(local.reshape(near.shape).astype(np.int32)))
+
 
 _MODES = 16
+# Skin that is looked at, one point in so many metres; how many for each vertex; and how far its
+# lee reaches [m].
+_SPACING, _NEAR, _REACH = 0.05, 4, 0.15
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class _Lee:
+    skin: Attached
+    near: Int[Array, "vertices k"]
+
+    def shade(self, base: Array, placed: Placed, wind: tuple[float, ...]) -> Array:
+        """How deep in the lee each vertex is, 0 to 1, shape [vertices, 1, batch]."""
+        way = np.asarray(wind) / np.linalg.norm(wind)
+        gap = placed.points[self.near] - base[:, None]
+        squared = jnp.sum(gap * gap, axis=2)
+        facing = jnp.sum(placed.normals * jnp.asarray(way, base.dtype)[None, :, None], axis=1)
+        least = jnp.min(squared, axis=1, keepdims=True)
+        # The normals of all that are about as near: one would make seams where it changes.
+        share = jnp.exp((least - squared) / (2 * (0.5 * _SPACING) ** 2))
+        away = jnp.sum(share * facing[self.near], axis=1) / jnp.sum(share, axis=1)
+        distance = jnp.sqrt(least[:, 0] + 1e-12)
+        return (jnp.clip(away, 0.0, 1.0) * jnp.clip(1.0 - distance / _REACH, 0.0, 1.0))[:, None]
 
 
 @pytree
@@ -92,10 +154,15 @@ class _Air(Prepared):
     once: Float[Array, "vertices k 1 1"]
     load: Float[Array, "vertices 1 1"]
     modes: tuple[Array, Array, Array, Array] | None
+    lee: _Lee | None
     law: Air = dataclasses.field(metadata={"static": True})
 
+    @property
+    def attached(self) -> Attached | None:
+        return None if self.lee is None else self.lee.skin
+
     def begin(
-        self, base: Array, start: None, end: None, clock: Clock, memory: Any
+        self, base: Array, start: Placed | None, end: Placed | None, clock: Clock, memory: Any
     ) -> tuple[Array, Array]:
         a, b, c = (base[self.faces[:, k]] for k in range(3))
         normal = jnp.cross(b - a, c - a, axis=1)
@@ -104,6 +171,8 @@ class _Air(Prepared):
         swell = 1.0 + self.law.gust * jnp.sin(2 * jnp.pi / self.law.period * clock.time)
         mean = jnp.asarray(self.law.wind, base.dtype)[None, :, None]
         wind = jnp.broadcast_to(swell * mean, base.shape)
+        if self.lee is not None and start is not None:
+            wind = wind * (1.0 - self.law.shelter * self.lee.shade(base, start, self.law.wind))
         if self.modes is not None:
             k, way, rate, phase = self.modes
             # Eddies travel with the wind.

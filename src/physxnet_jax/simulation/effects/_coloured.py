@@ -237,7 +237,10 @@ class Coloured(Prepared, abc.ABC):
                     w * jnp.sum(n * n, axis=1, keepdims=True)
                     for w, n in zip(weight, c.gradients, strict=True)
                 )
-                step = -c.value / (inertia + c.compliance / (h * h) + 1e-20)
+                resists = inertia + c.compliance / (h * h)
+                # Rigid, and all its corners held: nothing moves, and no derivative divides by it.
+                moves = resists > 0
+                step = jnp.where(moves, -c.value / jnp.where(moves, resists, 1.0), 0.0)
                 rows = [r + w * step * n for r, w, n in zip(rows, weight, c.gradients, strict=True)]
             return rows
 

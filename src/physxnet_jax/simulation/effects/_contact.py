@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES, Body, triangulate
+from ...errors import check_counts, check_numbers
 from ...geometry import closest_barycentric, spread_points, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
@@ -61,9 +62,9 @@ class BodyContact(Effect):
     leave: float = 1.0
 
     def __post_init__(self) -> None:
-        least = min(self.patch, self.ring, self.hops, self.centres)
-        if least < 1 or self.spacing <= 0 or self.push <= 0:
-            raise ValueError(f"{self}: every count, spacing and push must be positive.")
+        check_counts(self, "patch", "ring", "hops", "centres")
+        check_numbers(self, "spacing", "push")
+        check_numbers(self, "leave", zero=True)
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Patches around skin vertices, and where each cloth vertex starts."""

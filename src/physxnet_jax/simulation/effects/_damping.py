@@ -5,6 +5,7 @@ import math
 
 from jaxtyping import Array
 
+from ...errors import check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
@@ -21,6 +22,9 @@ class Damping(Effect):
     """
 
     rate: float = 1.0
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "rate", zero=True)
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Needs nothing from the scene."""

@@ -1,6 +1,7 @@
 """Gravity: a constant acceleration."""
 
 import dataclasses
+import math
 
 from jaxtyping import Array
 
@@ -18,6 +19,10 @@ class Gravity(Effect):
     """
 
     g: float = 9.81
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.g):
+            raise ValueError(f"g is {self.g}, expected a finite number")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Pinned vertices fall too; their pins put them back."""

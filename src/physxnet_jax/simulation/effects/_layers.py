@@ -9,6 +9,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES
+from ...errors import check_counts, check_numbers
 from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly, float32
@@ -20,6 +21,8 @@ from ._pairs import ClothContact, Facing, Pairs, closest_of, foot_of, rows_of, s
 _REACH = 0.25
 # A vertex deeper than this under its layer has lost its place there [m].
 _LOST = 0.05
+# Up to this depth a vertex on the wrong side is told of [m].
+_WATCHED = 0.25
 # Beyond the border of the other garment by more than this there is nothing to touch [m].
 _BESIDE = 0.002
 
@@ -54,6 +57,10 @@ class LayerContact(Effect):
     hops: int = 2
     ring: int = 12
     patch: int = 10
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "gap", "friction", "leave", zero=True)
+        check_counts(self, "hops", "ring", "patch")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Tables of each garment's surface, and where each vertex starts on the others."""
@@ -150,17 +157,20 @@ class _Layers(ClothContact):
         edge = jnp.sum(weights * (1.0 - self.rim[corners]), axis=0)[:, None] < 1e-3
         past = edge & (jnp.sum(beside * beside, axis=1, keepdims=True) > _BESIDE**2)
         close = self.adjoining[self.label[self.rows][:, None], self.label[at]][:, None]
-        active = close & ~past & (height > -_LOST)
+        over = close & ~past
+        active = over & (height > -_LOST)
         vertex = jnp.repeat(self.rows[:, None], base.shape[2], axis=1)
         # Against the true positions, so that the height has a derivative.
         height = jnp.sum((base[self.rows] - foot_of(base, corners, weights)) * n, axis=1)[:, None]
         pairs = Pairs(vertex, corners, weights, n, height, active.astype(base.dtype))
-        return Facing(pairs, clock, at)
+        watched = (over & (height > -_WATCHED)).astype(base.dtype)
+        return Facing(pairs, clock, at, watched)
 
     def diagnose(self, displacement: Array, context: Facing) -> dict[str, Array]:
         pairs = context.pairs
         height = pairs.heights(displacement)[:, 0]
-        wrong = (height < 0) & (pairs.active[:, 0] > 0)
+        watched = pairs.active if context.watched is None else context.watched
+        wrong = (height < 0) & (watched[:, 0] > 0)
         return {
             "layers_crossed": jnp.sum(wrong, axis=0),
             "layers_depth": jnp.max(jnp.where(wrong, -height, 0.0), axis=0, initial=0.0),

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ...errors import check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
@@ -35,8 +36,7 @@ class Membrane(Effect):
     compression: float = 0.2
 
     def __post_init__(self) -> None:
-        if not self.compression > 0:
-            raise ValueError(f"compression is {self.compression}, expected a positive number")
+        check_numbers(self, "compression")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Colours the triangles; slivers are left out."""
@@ -128,6 +128,27 @@ class _Membrane(Coloured):
             return Constraint(sine, (-(one + two), one, two), law["shear"])
 
         return [direction("u1", "u2", "warp"), direction("v1", "v2", "weft"), shear]
+
+    def hessian(self, displacement: Array, context: tuple) -> Array | None:
+        """Gauss-Newton, and across each taut direction what its tension adds."""
+        blocks = super().hessian(displacement, context)
+        if blocks is None:
+            return None
+        g = self.group
+        x = self._corners([displacement[i] for i in g.index], context[0])
+        eye = jnp.eye(3, dtype=displacement.dtype)[None, None]
+        more: list[Any] = [0.0] * 9
+        for one, two, compliance in (("u1", "u2", "warp"), ("v1", "v2", "weft")):
+            p, q = g.law[one][..., None], g.law[two][..., None]
+            w = jnp.swapaxes(g.law[one] * x[1] + g.law[two] * x[2], 1, 2)
+            length = jnp.sqrt(jnp.sum(w * w, axis=2, keepdims=True) + 1e-18)
+            n = w / length
+            taut = jnp.maximum(1.0 - 1.0 / length, 0.0)[..., None]
+            k = 1.0 / g.law[compliance][..., None]
+            across = k * taut * (eye - n[..., :, None] * n[..., None, :])
+            c = (-(p + q), p, q)
+            more = [m + c[i // 3] * c[i % 3] * across for i, m in enumerate(more)]
+        return blocks + jnp.concatenate(more)
 
     def diagnose(self, displacement: Array, context: tuple) -> dict[str, Array]:
         g = self.group

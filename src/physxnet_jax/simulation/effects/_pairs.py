@@ -56,11 +56,13 @@ class Facing:
         pairs: Who faces whom.
         clock: The block.
         kept: For the next block.
+        watched: 1 where the pair is looked at, whether it acts or not; None for ``active``.
     """
 
     pairs: Pairs
     clock: Clock
     kept: Any
+    watched: Float[Array, "pairs 1 batch"] | None = None
 
 
 @runtime_checkable

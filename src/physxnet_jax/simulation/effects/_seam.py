@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ...errors import SimulationError
+from ...errors import SimulationError, check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
@@ -28,6 +28,9 @@ class Seam(Effect):
 
     stitches: tuple[tuple[int, int], ...] = ()
     stiffness: float = 1e4
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "stiffness")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Colours the stitches so that a Gauss-Seidel sweep runs colour by colour."""

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ...errors import check_counts, check_numbers
 from ...geometry import connected_components, mesh_edges, vertex_faces
 from ...typing import pytree
 from .._assembly import Assembly
@@ -46,6 +47,11 @@ class SelfContact(Effect):
     reach: float | None = None
     every: int = 4
     room: int = 24
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "gap", "reach")
+        check_numbers(self, "friction", "leave", zero=True)
+        check_counts(self, "every", "room")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Tables of triangles and of who counts as a neighbour."""
@@ -158,7 +164,7 @@ class _Self(ClothContact):
             best = jnp.argmin(measure, axis=1)[:, None]
             there = jnp.isfinite(jnp.take_along_axis(measure, best, axis=1))[:, 0]
             out.append(jnp.where(there, jnp.take_along_axis(other, best, axis=1)[:, 0], -1))
-        return jnp.stack(out), jnp.sum(jnp.maximum(held - law.room, 0))
+        return jnp.stack(out), jnp.sum(jnp.maximum(held - law.room, 0), dtype=jnp.int32)
 
     def normals(self, x: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
         """Area-weighted vertex normals, not unit."""

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ...errors import check_numbers
 from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly
@@ -28,6 +29,9 @@ class StrainLimit(Effect):
     """
 
     limit: float = 0.1
+
+    def __post_init__(self) -> None:
+        check_numbers(self, "limit", zero=True)
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Colours the edges."""

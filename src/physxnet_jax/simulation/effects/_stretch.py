@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ...errors import check_numbers
 from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly
@@ -35,8 +36,7 @@ class Stretch(Effect):
     compression: float = 0.2
 
     def __post_init__(self) -> None:
-        if not self.compression > 0:
-            raise ValueError(f"compression is {self.compression}, expected a positive number")
+        check_numbers(self, "compression")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Colours the edges so that a Gauss-Seidel sweep runs colour by colour."""
