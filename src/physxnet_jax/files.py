@@ -5,12 +5,15 @@ import json
 import math
 import os
 import pathlib
+import tempfile
 import threading
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from .errors import FormatError
 
 
 @contextlib.contextmanager
@@ -64,6 +67,25 @@ def write_json(path: str | pathlib.Path, values: object) -> None:
     """Writes `json_text` of nested values, whole or not at all."""
     with whole_file(path) as part:
         part.write_text(json_text(values) + "\n", encoding="utf-8")
+
+
+def check_writable(path: str | pathlib.Path) -> None:
+    """Fails where a file couldn't be written; makes nothing.
+
+    Raises:
+        FormatError: A folder of that name, or a place where nothing can be made.
+    """
+    path = pathlib.Path(path)
+    if path.is_dir():
+        raise FormatError(f"{path}: a folder. Name a file in it.")
+    there = next((p for p in path.absolute().parents if p.exists()), pathlib.Path("/"))
+    try:
+        with tempfile.TemporaryFile(dir=there):
+            pass
+    except OSError as error:
+        raise FormatError(
+            f"{path}: nothing can be written there ({error.strerror}). Choose another folder."
+        ) from None
 
 
 def read_arrays(

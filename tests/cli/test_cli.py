@@ -11,7 +11,7 @@ from physxnet_jax._environment import check_jaxlib, jaxlib_problem
 from physxnet_jax.cli import main
 from physxnet_jax.cli._commands import Dress, Export, View
 from physxnet_jax.cli._main import _COMMANDS, parse
-from physxnet_jax.dressing import load_ladder
+from physxnet_jax.dressing import dress, load_ladder
 from physxnet_jax.errors import BrokenInstallError, MotionError, PhysXNetError
 from physxnet_jax.garment import template
 from physxnet_jax.io import DEFAULT, load_garment, read_obj, write_obj
@@ -235,3 +235,34 @@ def test_other_body_shapes_stand_on_the_floor(tmp_path):
     assert main(words) == 0
     with np.load(out) as data:
         assert abs(float(data["body_positions"][..., 1].min())) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--method", "simulate", "--budget-ms", "5"], "leave out --method"),
+        (["--weights", "small", "--max-error-mm", "9"], "leave out --weights"),
+        (["--no-push-out", "--budget-ms", "5"], "leave out --no-push-out"),
+        (["--accuracy", "fine"], "--accuracy is the simulator's"),
+        (["--method", "lbs", "--weights", "small"], "--method lbs has none"),
+        (["--own-body", "--start", "2"], "--start cuts motions"),
+        (["--start", "9"], "start is 9.0 s, but walk lasts from 0 to 4.00 s"),
+        (["--start", "-1"], "start is -1.0 s"),
+        (["-o", "/proc/x.npz"], "nothing can be written there"),
+        (["--preview", "/proc/x.png"], "nothing can be written there"),
+    ],
+)
+def test_options_that_cannot_both_be_meant_are_refused(words, said, capsys):
+    assert main(["dress", "walk", "--wear", "top", *words]) == 2
+    assert said in " ".join(capsys.readouterr().err.split())
+
+
+def test_work_that_would_be_lost_is_told_of_before_it_is_done(capsys, tmp_path):
+    words = ["dress", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "2"]
+    assert main(words) == 0
+    assert "nothing will be written" in capsys.readouterr().out
+    assert main([*words, "-o", str(tmp_path / "a.npz"), "--start", "1"]) == 0
+    assert "nothing will be written" not in capsys.readouterr().out
+    late = np.load(tmp_path / "a.npz")["bottom_positions"]
+    whole = dress("walk", ["bottom"], method="lbs", frames=32).garments[0].positions
+    np.testing.assert_allclose(late, whole[30:32], atol=1e-6)

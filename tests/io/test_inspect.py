@@ -305,3 +305,54 @@ def test_a_garment_that_lies_elsewhere_is_sent_to_its_place(tmp_path, what):
     # The control: deep in the body where it belongs it isn't.
     thin = saved(tmp_path, "c.obj", v * [0.97, 1.0, 0.9], np.asarray(mesh.faces))
     assert "--like" not in (inspect_garment(thin).command or "")
+
+
+@pytest.mark.parametrize("name", ["top", "bottom", "dress"])
+@pytest.mark.parametrize("change", ["backwards", "aside", "too small", "on the floor"])
+def test_wherever_a_garment_lies_it_is_sent_to_its_place(name, change, tmp_path, body):
+    mesh = template(name).mesh
+    floor = float(np.asarray(body.rest_mesh().vertices)[:, 1].min())
+    x = np.asarray(mesh.vertices)
+    x = {
+        "backwards": x * [-1, 1, -1],
+        "aside": x + [0.2, 0, 0],
+        "too small": x * 0.8,
+        "on the floor": x - [0, floor, 0],
+    }[change]
+    path = tmp_path / "a.obj"
+    write_obj(path, x, np.asarray(mesh.faces))
+    found = inspect_garment(path)
+    assert found.template == name
+    if change == "on the floor":
+        assert not found.problems, "people's feet are on it in many programs"
+        return
+    assert f"--like {name}" in found.command and "elsewhere" in " ".join(found.problems)
+    assert "lies in the body" in load_garment(path)[1].warning
+    done, after = fit_garment(path, tmp_path / "b.obj", like=name)
+    assert after.inside < 0.02 and after.template == name and done
+
+
+def test_objects_of_a_file_are_garments_of_their_own(tmp_path):
+    lines, first = [], 1
+    for name in ("top", "bottom"):
+        mesh = template(name).mesh
+        lines += [f"o my {name}", *(f"v {a} {b} {c}" for a, b, c in np.asarray(mesh.vertices))]
+        lines += ["f " + " ".join(str(k + first) for k in f) for f in np.asarray(mesh.faces)]
+        first += len(mesh.vertices)
+    path = tmp_path / "outfit.obj"
+    path.write_text("\n".join(lines) + "\n")
+    found = inspect_garment(path)
+    assert "several garments" in found.problems[0] and found.verdict.startswith("look at each")
+    assert all(f"outfit.obj#my {name}'" in found.command for name in ("top", "bottom"))
+    for name in ("top", "bottom"):
+        garment, _ = load_garment(f"{path}#my {name}")
+        np.testing.assert_array_equal(garment.mesh.faces, template(name).mesh.faces)
+        assert garment.template == name and garment.name == f"outfit_my {name}"
+    with pytest.raises(FormatError, match="no mesh 'hat'; there is my bottom, my top"):
+        load_garment(f"{path}#hat")
+    # Groups where there are no objects; one piece in two groups is one garment.
+    text = path.read_text().replace("o my", "g my")
+    path.write_text(text)
+    assert load_garment(f"{path}#my top")[0].num_vertices == template("top").num_vertices
+    path.write_text(text.replace("g my top", "g cloth").replace("g my bottom", "g cloth"))
+    assert not any("several" in p for p in inspect_garment(path).problems)

@@ -147,6 +147,9 @@ def test_what_is_no_garment_is_refused(trousers, tmp_path):
     with pytest.raises(FormatError, match="no such file"):
         read_mesh(tmp_path / "none.glb")
     path = saved(tmp_path, ".obj", trousers)
+    with pytest.raises(FormatError, match="no mesh 'sleeves'; there is one mesh without a name"):
+        read_mesh(f"{path}#sleeves")
+    path = saved(tmp_path, ".ply", trousers)
     with pytest.raises(FormatError, match="holds one mesh"):
         read_mesh(f"{path}#sleeves")
     with pytest.raises(PhysXNetError, match="or a file"):

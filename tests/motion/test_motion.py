@@ -2,12 +2,14 @@
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from physxnet_jax.errors import MotionError
+from physxnet_jax.geometry import quaternion_multiply
 from physxnet_jax.motion import (
     CLIPS,
     _procedural,
@@ -18,6 +20,7 @@ from physxnet_jax.motion import (
     resample,
     save_motion,
     slerp,
+    sudden_turns,
 )
 
 
@@ -136,3 +139,21 @@ def test_bad_arrays_are_refused(spoil, says):
     r[..., 0] = 1
     with pytest.raises(MotionError, match=says):
         make_motion(*spoil(r, np.zeros((3, 3))))
+
+
+def test_limbs_that_turn_over_within_a_frame_are_told_of(body):
+    for name in CLIPS:
+        assert sudden_turns(body, load_motion(name, fps=30)) is None, name
+    walk = load_motion("walk", fps=60)
+    turn = jnp.asarray([np.cos(0.75), 0.0, np.sin(0.75), 0.0], jnp.float32)  # 86 degrees
+    leg = body.joint("RightUpLeg")
+    q = walk.rotations.at[20, leg].set(quaternion_multiply(walk.rotations[20, leg], turn))
+    told = sudden_turns(body, dataclasses.replace(walk, rotations=q))
+    assert told is not None and "RightUpLeg turns by 8" in told and "another frame" in told
+    assert "from frame 19 to 20" in told or "from frame 20 to 21" in told
+    hand = body.joint("RightHand")
+    q = walk.rotations.at[20, hand].set(quaternion_multiply(walk.rotations[20, hand], turn))
+    assert sudden_turns(body, dataclasses.replace(walk, rotations=q)) is None
+    # At ten frames a second a limb may turn three times as far between two.
+    slow = load_motion("punch", fps=10)
+    assert sudden_turns(body, slow) is None

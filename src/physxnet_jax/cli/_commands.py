@@ -48,6 +48,8 @@ class Dress:
     """Pick the method: the fastest within this error on the test actions."""
     fps: float = 30.0
     """Frames a second of the result."""
+    start: float = 0.0
+    """Begin at this second of the motion."""
     frames: int | None = None
     """Stop after this many frames."""
     source_fps: float | None = None
@@ -253,6 +255,8 @@ class Simulate:
     """The ASF of an AMC file, if it doesn't lie beside it."""
     joint_map: pathlib.Path | None = None
     """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
+    start: float = 0.0
+    """Begin at this second of the motion."""
     frames: int | None = None
     """Stop after this many frames."""
     engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"

@@ -1,5 +1,6 @@
 """Entry point: one sentence and a fix for every error, exit code 2."""
 
+import dataclasses
 import os
 import pathlib
 import sys
@@ -27,7 +28,7 @@ from ._commands import (
 )
 from ._doctor import doctor
 from ._experiment_commands import Bench, Dataset, Evaluate, Stress, Train
-from ._progress import print_json, progress_bars
+from ._progress import UNWRITTEN, print_json, progress_bars
 from ._shape import parse_shape
 
 _COMMANDS: dict[str, type] = {
@@ -209,6 +210,26 @@ def _experiment(command: Dataset | Train | Evaluate, console: Console) -> int:
     return evaluate(command, console)
 
 
+def _check_ways(command: Dress) -> None:
+    """Fails where one option would have another one ignored."""
+    usual = {f.name: f.default for f in dataclasses.fields(Dress)}
+    told = [n for n in ("method", "weights", "accuracy") if getattr(command, n) != usual[n]]
+    if (command.budget_ms, command.max_error_mm) != (None, None):
+        if told or not command.push_out:
+            word = told[0] if told else "no-push-out"
+            raise PhysXNetError(
+                f"--budget-ms and --max-error-mm pick the way to dress: leave out --{word}."
+            )
+    if command.accuracy != usual["accuracy"] and command.method != "simulate":
+        raise PhysXNetError(
+            "--accuracy is the simulator's: add --method simulate, or leave it out."
+        )
+    if command.weights != usual["weights"] and command.method != "network":
+        raise PhysXNetError(f"--weights are a network's: --method {command.method} has none.")
+    if command.start and (command.own_body or command.character is not None):
+        raise PhysXNetError("--start cuts motions for the built-in body: leave it out.")
+
+
 def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) -> int:
     from ..body import load_body
     from ..dressing import dress, load_character
@@ -223,6 +244,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
         check_output(command.out)
     if command.preview is not None:
         check_preview(command.preview)
+    _check_ways(command)
     shape = load_body().shape(**parse_shape(command.shape)) if command.shape else None
     if command.own_body and (command.shape or command.joint_map or command.skeleton):
         raise PhysXNetError(
@@ -240,6 +262,8 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
         raise PhysXNetError("--character-map names joints of --character: add that.")
     if command.quiet or command.json:
         console = Console(quiet=True)
+    if command.out is None and command.preview is None and still is None:
+        console.print(UNWRITTEN)
     with progress_bars(console) as progress:
         motion = None
         if not command.own_body:
@@ -280,6 +304,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
             motion,
             command.wear,
             fps=command.fps,
+            start=command.start,
             frames=command.frames,
             shape=shape,
             include_body=command.body,

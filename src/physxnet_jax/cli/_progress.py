@@ -8,6 +8,9 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 
 from ..files import json_text
 
+UNWRITTEN = "nothing will be written: name a file with -o or --preview"
+"""Said before the work, where it would be lost."""
+
 
 @contextlib.contextmanager
 def progress_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:

@@ -27,7 +27,7 @@ from ..simulation import (
 )
 from ..viewer import check_preview, render_preview
 from ._commands import Effects, Simulate
-from ._progress import print_json, progress_bars
+from ._progress import UNWRITTEN, print_json, progress_bars
 
 
 def simulate(command: Simulate, console: Console) -> int:
@@ -36,6 +36,8 @@ def simulate(command: Simulate, console: Console) -> int:
         check_output(command.out)
     if command.preview is not None:
         check_preview(command.preview)
+    if command.out is None and command.preview is None and not command.json:
+        console.print(UNWRITTEN)
     also: list[Effect] = []
     if command.wind is not None:
         also.append(Air(wind=command.wind))
@@ -51,6 +53,7 @@ def simulate(command: Simulate, console: Console) -> int:
             source_fps=command.source_fps,
             skeleton=command.skeleton,
             joint_map=command.joint_map,
+            start=command.start,
             frames=command.frames,
             fabric=command.fabric,
             also=also,
@@ -118,7 +121,17 @@ def _is_scene(word: str) -> bool:
 
 
 # What a scene file tells itself, by the command's names.
-_TOLD = ("wear", "fabric", "wind", "self_contact", "fps", "source_fps", "skeleton", "joint_map")
+_TOLD = (
+    "start",
+    "wear",
+    "fabric",
+    "wind",
+    "self_contact",
+    "fps",
+    "source_fps",
+    "skeleton",
+    "joint_map",
+)
 
 
 def _scene_file(command: Simulate | Effects) -> SceneFile:

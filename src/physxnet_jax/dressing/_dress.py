@@ -15,7 +15,7 @@ from ..garment import Garment
 from ..geometry import Smoothing, make_springs
 from ..io import DEFAULT, AnimatedMesh, load_predictor
 from ..models import Predictor, Wearable, fold_batch_norm, make_surface, make_wearable
-from ..motion import Motion, before_transforms, clip_transforms
+from ..motion import Motion, before_transforms, clip_transforms, sudden_turns
 from ..simulation import ACCURACY
 from ..uv import Binding, Transference, bind
 from ._blocks import inside_share, lead_frames, lift_clip, predict_clip, simulate_clip
@@ -83,6 +83,7 @@ def dress(
     method: Method = "network",
     accuracy: str = "standard",
     fps: float | int = 30.0,
+    start: float = 0.0,
     frames: int | None = None,
     weights: str | pathlib.Path | Predictor = DEFAULT,
     body: Body | None = None,
@@ -102,6 +103,7 @@ def dress(
             or ``simulate`` (the cloth simulator, the network's teacher).
         accuracy: Of ``simulate``: ``draft``, ``standard`` or ``fine``.
         fps: Frames a second of the result.
+        start: Where in the motion to begin [s].
         frames: Keep only this many frames.
         weights: Name or folder of network weights, or a predictor.
         body: The body; the built-in one by default.
@@ -130,6 +132,8 @@ def dress(
     if person is not None:
         if body is not None or shape is not None:
             raise PhysXNetError("A character has a body of its own: leave out body and shape.")
+        if start:
+            raise PhysXNetError("A character begins where its file does: leave out start.")
         motion, body, fps = person.motion, person.body, person.fps
     stages: list[Stage] = []
     watch = Watch(stages)
@@ -137,7 +141,8 @@ def dress(
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     with watch("motion"):
         assert not isinstance(motion, Character)
-        clip = wanted_clip(motion, fps=fps, body=body, shape=shape, frames=frames)
+        clip = wanted_clip(motion, fps=fps, body=body, shape=shape, start=start, frames=frames)
+        fault = sudden_turns(body, clip)
         world, shift = clip_transforms(body, rest, clip)
     with watch("garments"):
         # A character's clothes are modelled on the body as it is, and carried over.
@@ -217,7 +222,11 @@ def dress(
         inside if inside_raw is None else inside_raw,
         inside,
         method,
-        notes if person is None else (*person.notes, *notes),
+        (
+            *(() if fault is None else (fault,)),
+            *(() if person is None else person.notes),
+            *notes,
+        ),
     )
 
 

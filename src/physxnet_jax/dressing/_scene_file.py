@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ..body import load_body
 from ..errors import FormatError
 from ..garment import FABRICS, Garment
-from ..motion import Motion
+from ..motion import Motion, sudden_turns
 from ..simulation import ACCURACY, EFFECTS, Air, Damping, Effect, Scene, standard_effects
 from ._layers import inside_out
 from ._meshes import worn_garments
@@ -23,6 +23,7 @@ _KEYS: dict[str, type | tuple[type, ...]] = {
     "skeleton": str,
     "joint_map": str,
     "fps": (int, float),
+    "start": (int, float),
     "frames": int,
     "accuracy": str,
     "garments": list,
@@ -40,7 +41,7 @@ class SceneFile:
         scene: Garments, effects, shape.
         motion: The body's motion.
         accuracy: ``draft``, ``standard`` or ``fine``.
-        notes: What is good to know of garments read from files.
+        notes: What is good to know of the motion, and of garments read from files.
     """
 
     scene: Scene
@@ -57,6 +58,7 @@ def make_scene(
     source_fps: float | None = None,
     skeleton: str | pathlib.Path | None = None,
     joint_map: str | pathlib.Path | None = None,
+    start: float = 0.0,
     frames: int | None = None,
     accuracy: str = "standard",
     fabric: str | None = None,
@@ -73,6 +75,7 @@ def make_scene(
         source_fps: True rate of a motion file [1/s], where its header is wrong or silent.
         skeleton: The ASF of an AMC file, if it doesn't lie beside it.
         joint_map: File of joint names, for a motion file of unknown ones.
+        start: Where in the motion to begin [s].
         frames: Keep only this many frames.
         accuracy: ``draft``, ``standard`` or ``fine``.
         fabric: Name of a fabric for all garments; their own if None.
@@ -93,6 +96,7 @@ def make_scene(
         fps=fps,
         body=body,
         shape=shape,
+        start=start,
         frames=frames,
         source_fps=source_fps,
         skeleton=skeleton,
@@ -107,7 +111,8 @@ def make_scene(
         # Damping stands for still air: with both it would be there twice.
         acting = tuple(e for e in acting if not isinstance(e, Damping))
     scene = Scene(tuple(garments), _merged(acting, also), body, shape)
-    return SceneFile(scene, clip, accuracy, notes)
+    fault = sudden_turns(body, clip)
+    return SceneFile(scene, clip, accuracy, notes if fault is None else (fault, *notes))
 
 
 def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneFile:
@@ -124,6 +129,7 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         skeleton = "02.asf"        # of an AMC file, if it doesn't lie beside it
         joint_map = "names.toml"   # only for a file of unknown joint names
         garments = ["bottom", "top"]
+        start = 0.5                # seconds
         frames = 60
         accuracy = "standard"
 
@@ -184,13 +190,14 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         source_fps=text.get("source_fps"),
         skeleton=_beside(path, text["skeleton"]) if "skeleton" in text else None,
         joint_map=_beside(path, text["joint_map"]) if "joint_map" in text else None,
+        start=float(text.get("start", 0.0)),
         frames=min((n for n in (frames, text.get("frames")) if n is not None), default=None),
         accuracy=text.get("accuracy", "standard"),
         shape=load_body().shape(**text["shape"]) if "shape" in text else None,
         effects=_effects(path, text["effects"]) if "effects" in text else None,
         also=_effects(path, text.get("also", {})),
     )
-    return dataclasses.replace(made, notes=notes)
+    return dataclasses.replace(made, notes=(*made.notes, *notes))
 
 
 def made_of(garment: Garment, fabric: str) -> Garment:

@@ -17,6 +17,7 @@ def wanted_clip(
     fps: float | None,
     body: Body,
     shape: Float[Array, " shapes"] | None = None,
+    start: float = 0.0,
     frames: int | None = None,
     source_fps: float | None = None,
     skeleton: str | pathlib.Path | None = None,
@@ -29,14 +30,15 @@ def wanted_clip(
         fps: Frames a second; a `Motion`'s own if None, else 30.
         body: The body.
         shape: Shape parameters; the default shape if None.
+        start: Where in the motion to begin [s].
         frames: Keep only this many frames.
         source_fps: True rate of a motion file [1/s].
         skeleton: The ASF of an AMC file.
         joint_map: Joint names of a motion file.
 
     Raises:
-        MotionError: What can't be read; fewer than one frame; what is said of a file where
-            there is none.
+        MotionError: What can't be read; fewer than one frame; a start behind the end; what
+            is said of a file where there is none.
     """
     if frames is not None and frames < 1:
         raise MotionError(f"frames is {frames}; ask for at least one.")
@@ -62,6 +64,14 @@ def wanted_clip(
             body=body,
             shape=shape,
         )
-    if frames is None:
+    first = start * clip.fps
+    if not 0.0 <= first < clip.num_frames:
+        raise MotionError(
+            f"start is {start} s, but {clip.name or 'the motion'} lasts from 0 to"
+            f" {clip.num_frames / clip.fps:.2f} s."
+        )
+    if first == 0 and frames is None:
         return clip
-    return dataclasses.replace(clip, rotations=clip.rotations[:frames], root=clip.root[:frames])
+    begin = round(first)
+    kept = slice(begin, None if frames is None else begin + frames)
+    return dataclasses.replace(clip, rotations=clip.rotations[kept], root=clip.root[kept])

@@ -180,7 +180,7 @@ def recommend_effects(
             least = float(rollout.diagnostics["self_gap"].min())
             if least >= e.gap:
                 needed = False
-                near = "as near to itself as is watched"
+                near = "nearer to itself than is watched"
                 if math.isfinite(least):
                     near = f"nearer to itself than {1e3 * least:.1f} mm"
                 said = f"Cloth never comes {near}."

@@ -39,6 +39,10 @@ from ._mesh_file import GARMENT_FORMATS, mesh_name, read_mesh, split_part
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
 NEAREST = 0.003
+# Share of a garment inside the body from which it may lie elsewhere [1].
+ELSEWHERE = 0.1
+# How much better a garment that stands on the floor fits there than about the origin [1].
+_CLEARLY = 0.6
 # What hangs farther off the skin with its highest tenth, or has longer edges, looks wrong [m].
 HANGS, LONG = 0.02, 0.04
 _TOPMOST = 0.1
@@ -81,6 +85,8 @@ class GarmentReport:
     def warning(self) -> str | None:
         """What will look wrong when it is worn as it is, and what to do."""
         found = []
+        if self.inside > ELSEWHERE:
+            found.append(f"{100 * self.inside:.0f} % of it lies in the body or on it")
         if self.hangs > HANGS:
             found.append(f"its top stays {1e3 * self.hangs:.0f} mm off the skin")
         if self.longest_edge > LONG:
@@ -236,13 +242,18 @@ def place_on_body(
     for up in ("Y", "Z"):
         turned = vertices if up == "Y" else vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
         for unit, scale in UNITS.items():
+            if not 0.1 < np.ptp(turned * scale, axis=0).max() < 2.5:
+                continue
+            unmoved = np.inf
             for shift in (np.zeros(3), floor):
                 v = turned * scale + shift
-                size = np.ptp(v, axis=0).max()
-                if not 0.1 < size < 2.5:
-                    continue
                 # A garment too small by a unit lies close to the skin, but within it.
                 score = misfit(v, 0.015)
+                # Legs are near whatever hangs askew about them: what stands on the floor
+                # fits far better there than about the origin.
+                if shift.any() and score > _CLEARLY * unmoved:
+                    continue
+                unmoved = score
                 if score < best[0] - 1e-9:
                     best = (score, v, unit, up)
     score, v, unit, up = best

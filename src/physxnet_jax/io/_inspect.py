@@ -1,5 +1,6 @@
 """What a garment file is like, and what is wrong with it."""
 
+import contextlib
 import dataclasses
 import pathlib
 import shlex
@@ -18,12 +19,14 @@ from ..garment import (
     mesh_health,
     template,
 )
-from ..geometry import make_mesh
+from ..geometry import TriMesh, make_mesh
 from ..uv import bind, garment_map_rows, make_atlas
 from ._garment import (
+    ELSEWHERE,
     HANGS,
     LONG,
     NEAREST,
+    guess_template,
     hangs_off,
     load_garment,
     place_on_body,
@@ -33,9 +36,11 @@ from ._mesh_file import mesh_name, read_mesh
 
 # Shares and lengths beyond which a garment is worth a word [1], [m].
 _INSIDE, _FINE, _MISSED = 0.02, 0.003, 0.1
-# Share inside the body from which a garment may lie elsewhere, and how much nearer to the skin
-# it has to be where it belongs.
-_ELSEWHERE, _NEARER = 0.1, 0.85
+# How long a garment is at least, and how many meshes of a file are looked at [m].
+_GARMENT, _MOST_PARTS = 0.25, 20
+# How much nearer to the skin a garment that lies elsewhere has to be where it belongs, and the
+# share of its rays below which one that is far from the skin may lie elsewhere [1].
+_NEARER, _UNBOUND = 0.85, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +92,8 @@ class Inspection:
         """``ready``, or what to do."""
         if not self.problems:
             return "ready: it can be worn as it is."
-        return f"mend it first: {self.command}"
+        several = (self.command or "").startswith("physxnet inspect")
+        return f"{'look at each' if several else 'mend it first'}: {self.command}"
 
 
 def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> Inspection:
@@ -148,18 +154,14 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         )
     if inside > _INSIDE:
         problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
-    if inside > _ELSEWHERE:
-        # Worn the wrong way round or at another height: lifting it out would ruin it.
-        placed, told, _ = place_like(raw.vertices, template(garment.template), skin)
-        there, _ = clearance(skin, np.asarray(placed, np.float32))
-        nearer = float(np.mean(np.abs(there))) < _NEARER * float(np.mean(np.abs(distance)))
-        share = float(np.mean(there < NEAREST))
-        if nearer and share < 0.7 * inside:
-            problems.append(
-                f"it lies or faces elsewhere than a {garment.template}: {told.rstrip('.')}, it has"
-                f" {100 * share:.1f} % there."
-            )
-            options.append(f"--like {garment.template}")
+    loose = hit_rate < _UNBOUND and float(np.median(np.abs(distance))) > LONG
+    if inside > ELSEWHERE or loose:
+        # Worn the wrong way round or in another place: lifting it out would ruin it.
+        found = _elsewhere(raw.vertices, distance, skin)
+        if found is not None:
+            name, told = found
+            problems.append(f"it lies or faces elsewhere than a {name}: {told}")
+            options.append(f"--like {name}")
     if hangs > HANGS:
         problems.append(
             f"its top stays {1e3 * hangs:.0f} mm off the skin, where nothing holds it up."
@@ -176,11 +178,19 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
             f"edges of {1e3 * health.median_edge:.1f} mm: finer than any map here; `physxnet fit"
             " --decimate 8` would make it quicker."
         )
+    outfit = None
     if len(raw.parts) > 1:
-        notes.append(
-            f"made of {len(raw.parts)} meshes ({', '.join(raw.parts)[:200]}): `{path}#NAME`"
-            " takes one of them."
-        )
+        kinds = _kinds(path, raw.parts, body)
+        if len(set(kinds.values())) > 1:
+            told = ", ".join(f"{name} is dressed by {kind}" for name, kind in kinds.items())
+            problems.append(f"it holds several garments, which are worn apart: {told}.")
+            words = [shlex.quote(f"{path}#{name}") for name in kinds]
+            outfit = f"physxnet inspect {' '.join(words)}"
+        else:
+            notes.append(
+                f"made of {len(raw.parts)} meshes ({', '.join(raw.parts)[:200]}): `{path}#NAME`"
+                " takes one of them."
+            )
     if health.components > 1:
         notes.append(f"{health.components} parts that nothing joins: each moves by itself.")
     if hit_rate < 1 - _MISSED:
@@ -191,8 +201,36 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     return Inspection(
         path, unit, up, size, health, raw.count, float(np.median(np.abs(distance))),
         float(distance.max()), hangs, inside, outward, garment.template, _apart(v), hit_rate,
-        tuple(problems), tuple(notes), _command(path, options) if problems else None,
+        tuple(problems), tuple(notes),
+        outfit or (_command(path, options) if problems else None),
     )  # fmt: skip
+
+
+def _kinds(path: pathlib.Path, parts: tuple[str, ...], body: Body) -> dict[str, Template]:
+    """What each mesh of a file would be dressed by, as far as it is large and on the body."""
+    found: dict[str, Template] = {}
+    for name in parts[:_MOST_PARTS]:
+        mesh = read_mesh(f"{path}#{name}")
+        with contextlib.suppress(MeshError):
+            v, _, _ = place_on_body(path, mesh.vertices, body)
+            if np.ptp(v, axis=0).max() > _GARMENT:
+                found[name] = guess_template(v, mesh.faces)
+    return found
+
+
+def _elsewhere(
+    vertices: np.ndarray, distance: np.ndarray, skin: TriMesh
+) -> tuple[Template, str] | None:
+    """The template whose place a garment fits better than where it is, and how it fits there."""
+    tried = {name: place_like(vertices, template(name), skin) for name in TEMPLATES}
+    name: Template = min(TEMPLATES, key=lambda n: tried[n][2])
+    placed, told, _ = tried[name]
+    there, _ = clearance(skin, np.asarray(placed, np.float32))
+    now, then = (float(np.mean(x < NEAREST)) for x in (distance, there))
+    nearer = float(np.mean(np.abs(there))) < _NEARER * float(np.mean(np.abs(distance)))
+    if then > (0.7 if nearer else 0.25) * now:
+        return None
+    return name, f"{told.rstrip('.')}, it has {100 * then:.1f} % of its vertices in the body."
 
 
 def _apart(vertices: np.ndarray) -> dict[Template, float]:

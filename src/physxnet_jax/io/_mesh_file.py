@@ -52,10 +52,12 @@ def read_mesh(path: str | pathlib.Path) -> StillMesh:
         raise FormatError(f"{path}: no such file. Check the path.")
     if path.stat().st_size > _MAX_BYTES:
         raise FormatError(f"{path}: over 500 MB. Decimate the mesh first.")
-    if suffix in (".obj", ".ply", ".stl"):
+    if suffix == ".obj":
+        return read_obj(path, part)
+    if suffix in (".ply", ".stl"):
         if part is not None:
             raise FormatError(f"{path}: holds one mesh, so '#{part}' says nothing. Leave it out.")
-        return read_obj(path) if suffix == ".obj" else _read_plain(path)
+        return _read_plain(path)
     if suffix in (".glb", ".gltf"):
         from ._gltf_character import read_gltf_still as read
     else:

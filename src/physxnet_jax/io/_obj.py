@@ -16,11 +16,13 @@ _MAX_BYTES = 500_000_000
 _MAX_LIBRARY = 5_000_000
 
 
-def read_obj(path: str | pathlib.Path) -> StillMesh:
+def read_obj(path: str | pathlib.Path, part: str | None = None) -> StillMesh:
     """Reads an OBJ; quads are split along their shorter diagonal, others in a fan.
 
     Args:
         path: The file.
+        part: Name of the object to take, or of the group in a file without objects; all
+            of them if omitted.
 
     Returns:
         The mesh; vertex order is kept. Polygons keep the names of their materials, and the
@@ -28,7 +30,7 @@ def read_obj(path: str | pathlib.Path) -> StillMesh:
 
     Raises:
         FormatError: Missing, empty, binary or malformed files; indices out of range;
-            values that aren't finite. File, line and fix are named.
+            values that aren't finite; no part of that name. File, line and fix are named.
     """
     path = pathlib.Path(path)
     if not path.is_file():
@@ -44,6 +46,8 @@ def read_obj(path: str | pathlib.Path) -> StillMesh:
     where: list[int] = []
     names: dict[str, int] = {}
     used, material = -1, list[int]()
+    owners: dict[str, list[str]] = {"o": [], "g": []}
+    current = {"o": "", "g": ""}
     libraries: list[str] = []
     for n, line in enumerate(blob.decode("utf-8", "replace").splitlines(), start=1):
         words = line.split("#")[0].split()
@@ -57,8 +61,12 @@ def read_obj(path: str | pathlib.Path) -> StillMesh:
             polygons.append([_corner(path, n, w, len(vertices), len(uv)) for w in words[1:]])
             where.append(n)
             material.append(used)
+            for kind, owner in owners.items():
+                owner.append(current[kind])
             if len({c[0] for c in polygons[-1]}) < 3:
                 raise FormatError(f"{path}:{n}: a face of fewer than three vertices. Delete it.")
+        elif words[0] in current:
+            current[words[0]] = _rest(line)
         elif words[0] == "usemtl":
             used = names.setdefault(_rest(line), len(names))
         elif words[0] == "mtllib":
@@ -76,6 +84,19 @@ def read_obj(path: str | pathlib.Path) -> StillMesh:
                     f"{path}:{n}: a face names vertex {a + 1} or uv {t + 1}, but there"
                     f" are {len(v)} and {len(uv)}. Export the file again."
                 )
+    owner = owners["o"] if len(set(owners["o"])) > 1 or any(owners["o"]) else owners["g"]
+    parts = tuple(sorted({name for name in owner if name}))
+    if part is not None:
+        rows = [k for k, name in enumerate(owner) if name == part]
+        if not rows:
+            there = ", ".join(parts)[:300] or "one mesh without a name"
+            raise FormatError(f"{path}: no mesh '{part}'; there is {there}.")
+        polygons, material = [polygons[k] for k in rows], [material[k] for k in rows]
+        # The others' vertices belong to no face any more; the order stays.
+        kept, at = np.unique([c[0] for p in polygons for c in p], return_inverse=True)
+        v, new = v[kept], iter(at.tolist())
+        polygons = [[(next(new), t) for _, t in p] for p in polygons]
+        parts = (part,)
     corners = [c for p in polygons for c in _split(p, v)]
     table = np.asarray(corners)
     has_uv = bool(uv) and bool((table[..., 1] >= 0).all())
@@ -86,6 +107,7 @@ def read_obj(path: str | pathlib.Path) -> StillMesh:
         table[..., 1] if has_uv else None,
         _drawn(polygons, material, names, _colours(path, libraries), textured=has_uv),
         len(polygons),
+        parts,
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import FormatError
-from ..files import whole_file
+from ..files import check_writable, whole_file
 from ._clip import AnimatedMesh
 from ._gltf import check_gltf, write_gltf
 from ._html import write_html
@@ -30,7 +30,8 @@ def check_output(path: str | pathlib.Path, frames: int | None = None) -> pathlib
         frames: How many there will be, if that is known.
 
     Raises:
-        FormatError: Another extension, whose text lists them, or too many frames.
+        FormatError: Another extension, whose text lists them, too many frames, or a place
+            where nothing can be written.
         MissingDependencyError: A library that the format needs isn't there.
     """
     path = pathlib.Path(path)
@@ -42,6 +43,7 @@ def check_output(path: str | pathlib.Path, frames: int | None = None) -> pathlib
         check_usd()
     if path.suffix.lower() in (".glb", ".html"):
         check_gltf(path, frames)
+    check_writable(path)
     return path
 
 

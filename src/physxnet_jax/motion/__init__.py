@@ -4,6 +4,7 @@ from ._amass import amass_clip as amass_clip
 from ._asf_amc import read_amc as read_amc
 from ._bvh import read_bvh as read_bvh
 from ._drive import drive as drive
+from ._faults import sudden_turns as sudden_turns
 from ._follow import follow_surface as follow_surface
 from ._gltf import read_gltf as read_gltf
 from ._gltf_file import GLTF_FORMATS as GLTF_FORMATS, GltfFile as GltfFile

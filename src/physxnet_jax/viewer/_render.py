@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FormatError, MissingDependencyError
-from ..files import whole_file
+from ..files import check_writable, whole_file
 from ..io import AnimatedMesh
 
 PREVIEWS = (".mp4", ".gif", ".png")
@@ -201,7 +201,7 @@ def check_preview(path: str | pathlib.Path) -> pathlib.Path:
     """The path, if its extension is one that can be rendered and there is what renders it.
 
     Raises:
-        FormatError: Another extension.
+        FormatError: Another extension, or a place where nothing can be written.
         MissingDependencyError: Without the ``render`` extra.
     """
     path = pathlib.Path(path)
@@ -209,4 +209,5 @@ def check_preview(path: str | pathlib.Path) -> pathlib.Path:
         raise FormatError(f"{path}: a preview is one of {', '.join(PREVIEWS)}.")
     if any(importlib.util.find_spec(name) is None for name in ("pyvista", "imageio")):
         raise MissingDependencyError("Pictures need pyvista: pip install 'physxnet-jax[render]'.")
+    check_writable(path)
     return path

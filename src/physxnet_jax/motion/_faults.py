@@ -1,0 +1,45 @@
+"""What is wrong with a motion that clothes will show."""
+
+import numpy as np
+
+from ..body import Body
+from ._motion import Motion
+
+# Limbs don't turn faster than this between frames [degrees], at 30 of them a second or more.
+_FASTEST = 60.0
+_JOINTS = ("Hips", "Spine", "UpLeg", "Leg", "Arm", "ForeArm")
+
+
+def sudden_turns(body: Body, motion: Motion) -> str | None:
+    """A sentence about limbs that turn over within a frame, as captured motion may have it.
+
+    Args:
+        body: The body.
+        motion: The motion.
+
+    Returns:
+        Which joint, where and how often; None if nothing turns faster than people do.
+    """
+    q = np.asarray(motion.rotations, np.float64)
+    if len(q) < 2:
+        return None
+    names = body.joint_names
+    rows = [
+        k for k, n in enumerate(names) if n.removeprefix("Left").removeprefix("Right") in _JOINTS
+    ]
+    dots = np.abs(np.sum(q[1:, rows] * q[:-1, rows], axis=2))
+    lengths = np.linalg.norm(q[:, rows], axis=2)
+    cosine = np.clip(dots / np.maximum(lengths[1:] * lengths[:-1], 1e-12), 0.0, 1.0)
+    degrees = np.degrees(2.0 * np.arccos(cosine))
+    sudden = degrees > _FASTEST * max(1.0, 30.0 / motion.fps)
+    if not sudden.any():
+        return None
+    frame, which = np.unravel_index(int(degrees.argmax()), degrees.shape)
+    more = int(sudden.any(axis=1).sum()) - 1
+    others = f", and {more} other frames are alike" if more > 1 else ""
+    others = ", and another frame is alike" if more == 1 else others
+    return (
+        f"{motion.name or 'the motion'}: {names[rows[which]]} turns by {degrees[frame, which]:.0f}"
+        f" degrees from frame {frame} to {frame + 1}{others}: nobody moves like that, and clothes"
+        " will be thrown about there."
+    )
