@@ -10,12 +10,13 @@ from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
 from physxnet_jax.dressing import dress
 from physxnet_jax.errors import FormatError, MeshError
-from physxnet_jax.garment import template
+from physxnet_jax.garment import decimate, template
 from physxnet_jax.geometry import make_mesh
 from physxnet_jax.io import fit_garment, inspect_garment, load_garment, read_obj, write_obj
 from physxnet_jax.io._drape import drape
-from physxnet_jax.io._garment import carried, guess_template, place_on_body
+from physxnet_jax.io._garment import carried, guess_template
 from physxnet_jax.io._like import place_like
+from physxnet_jax.io._place import place_on_body
 
 
 @pytest.fixture(scope="module")
@@ -281,7 +282,7 @@ def test_a_template_is_reported_as_its_file_is(tmp_path, name):
 def test_legs_are_trousers_whatever_is_above_or_closed_below(data_dir, trousers):
     """Overalls and tights with feet: two tubes, though they reach to the neck or have no opening."""
     raw = read_obj(data_dir / "garments/helper_tights.obj")
-    v, _, _ = place_on_body(data_dir / "tights.obj", raw.vertices, load_body())
+    v, *_ = place_on_body(data_dir / "tights.obj", raw.vertices, load_body(), raw.faces)
     assert guess_template(v, raw.faces) == "bottom"
     low = (v[raw.faces, 1] < 0.1).all(axis=1)
     assert guess_template(v, raw.faces[low]) == "bottom"
@@ -356,3 +357,40 @@ def test_objects_of_a_file_are_garments_of_their_own(tmp_path):
     assert load_garment(f"{path}#my top")[0].num_vertices == template("top").num_vertices
     path.write_text(text.replace("g my top", "g cloth").replace("g my bottom", "g cloth"))
     assert not any("several" in p for p in inspect_garment(path).problems)
+
+
+@pytest.mark.parametrize("name", ["top", "bottom"])
+def test_a_garment_made_for_a_t_pose_is_brought_to_the_rest_pose(name, tmp_path, body, rest):
+    g = template(name)
+    pose = body.transforms(rest, body.t_pose(), body.joint_positions(rest)[0][0])
+    r, t = (np.asarray(x, float) for x in pose)
+    w, x = np.asarray(g.skin, float), np.asarray(g.mesh.vertices, float)
+    posed = np.einsum("vj,jab,vb->va", w, r, x) + w @ t
+    path = saved(tmp_path, "t.obj", 100 * posed, np.asarray(g.mesh.faces))
+    worn, report = load_garment(path)
+    assert report.posed and report.unit == "cm" and worn.template == name
+    off = np.linalg.norm(np.asarray(worn.mesh.vertices) - x, axis=1)
+    assert (
+        np.quantile(off, 0.95) < 3e-3
+        and np.quantile(np.linalg.norm(posed - x, axis=1), 0.95) > 0.05
+    )
+    assert any("T-pose" in note for note in inspect_garment(path).notes)
+    done, after = fit_garment(path, tmp_path / "rest.obj")
+    assert any("T-pose" in d for d in done)
+    assert not load_garment(tmp_path / "rest.obj")[1].posed
+    # The control: what lies on the body at rest stays as it is.
+    plain = load_garment(saved(tmp_path, "a.obj", x, np.asarray(g.mesh.faces)))
+    assert not plain[1].posed and np.abs(np.asarray(plain[0].mesh.vertices) - x).max() < 2e-3
+
+
+def test_real_garments_were_made_for_the_rest_pose(data_dir):
+    found = {p.stem: load_garment(p)[1].posed for p in (data_dir / "garments").glob("*.obj")}
+    assert len(found) == 8 and not any(found.values())
+
+
+def test_edges_are_as_short_as_asked_for_whatever_lifting_does(tmp_path):
+    coarse = decimate(template("top").mesh, 0.07)
+    path = saved(tmp_path, "a.obj", np.asarray(coarse.vertices), np.asarray(coarse.faces))
+    assert "--edge-length 20" in inspect_garment(path).command
+    _, after = fit_garment(path, tmp_path / "b.obj", edge_length=0.02)
+    assert after.health.longest_edge < 0.025 and after.command is None

@@ -3,13 +3,11 @@
 import dataclasses
 import pathlib
 import shlex
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import KDTree
 
 from ..body import Body, load_body
 from ..errors import MeshError
@@ -18,31 +16,24 @@ from ..garment import (
     TEMPLATES,
     Garment,
     Template,
-    carried_weights,
     clearance,
     lift_out,
-    smoothing_matrix,
     template,
 )
 from ..geometry import (
     TriMesh,
     boundary_loops,
-    closest_among,
     connected_components,
     make_mesh,
     manifold_report,
     mesh_edges,
-    nearby_faces,
-    vertex_normals,
 )
 from ._mesh_file import GARMENT_FORMATS, mesh_name, read_mesh, split_part
+from ._place import nearest_skin, place_on_body
 
-UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
 NEAREST = 0.003
 # Share of a garment inside the body from which it may lie elsewhere [1].
 ELSEWHERE = 0.1
-# How much better a garment that stands on the floor fits there than about the origin [1].
-_CLEARLY = 0.6
 # What hangs farther off the skin with its highest tenth, or has longer edges, looks wrong [m].
 HANGS, LONG = 0.02, 0.04
 _TOPMOST = 0.1
@@ -67,6 +58,7 @@ class GarmentReport:
         template: The template it is dressed by.
         hangs: How far its highest tenth stays from the skin [m].
         longest_edge: Length of its longest edge [m].
+        posed: Whether it was made for a T-pose, and its sleeves and legs were turned down.
     """
 
     path: str
@@ -80,6 +72,7 @@ class GarmentReport:
     template: str
     hangs: float
     longest_edge: float
+    posed: bool = False
 
     @property
     def warning(self) -> str | None:
@@ -143,7 +136,7 @@ def load_garment(
         )
     raw = read_mesh(path)
     mesh = body.rest_mesh()
-    v, unit, up = place_on_body(path, raw.vertices, body)
+    v, unit, up, posed = place_on_body(path, raw.vertices, body, raw.faces)
     distance, _ = clearance(mesh, v)
     moved, inside = lift_out(mesh, v, raw.faces, NEAREST)
     kind = guess_template(moved, raw.faces) if kind is None else kind
@@ -155,7 +148,7 @@ def load_garment(
     )
     garment = dataclasses.replace(garment, polygons=raw.polygons)
     report = _report(str(path), unit, up, v, raw.faces, inside, distance, kind)
-    return garment, report
+    return garment, dataclasses.replace(report, posed=posed)
 
 
 def _report(
@@ -200,13 +193,9 @@ def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
     skin = body.rest_mesh()
     rest = body.rest_vertices(body.default_shape())
     v, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    near = nearby_faces(np.asarray(skin.vertices), np.asarray(skin.faces), v, neighbours=12)
     points = jnp.asarray(v.astype(np.float32))
-    hit = jax.jit(closest_among)(skin, points, jnp.asarray(near))
-    refs = skin.faces[hit.face]
-    foot = jnp.einsum("vk,vkc->vc", hit.weights, rest[refs], precision=jax.lax.Precision.HIGHEST)
-    weights = np.asarray(carried_weights(body.weights, refs, hit.weights))
-    weights = _smooth_far(weights, faces, np.sqrt(np.asarray(hit.squared_distance)))
+    refs, shares, weights = nearest_skin(skin, body, v, faces)
+    foot = jnp.einsum("vk,vkc->vc", shares, rest[refs], precision=jax.lax.Precision.HIGHEST)
     pinned = np.zeros(len(v), dtype=bool)
     loops = boundary_loops(faces)
     if kind == "bottom" and loops:
@@ -217,70 +206,13 @@ def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
         mesh,
         jnp.asarray(pinned),
         refs,
-        hit.weights,
+        shares,
         points - foot,
         jnp.asarray(weights.astype(np.float32)),
         COTTON,
         kind,
         name,
     )
-
-
-def place_on_body(
-    path: pathlib.Path, vertices: Float[np.ndarray, "vertices 3"], body: Body
-) -> tuple[Float[np.ndarray, "vertices 3"], str, str]:
-    """The mesh in metres, by the unit and up axis that bring it closest to the skin.
-
-    Raises:
-        MeshError: None does.
-    """
-    mesh = body.rest_mesh()
-    skin = np.asarray(mesh.vertices)
-    misfit = skin_misfit(mesh)
-    floor = np.array([0.0, float(skin[:, 1].min()), 0.0])
-    best = (np.inf, vertices, "m", "Y")
-    for up in ("Y", "Z"):
-        turned = vertices if up == "Y" else vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
-        for unit, scale in UNITS.items():
-            if not 0.1 < np.ptp(turned * scale, axis=0).max() < 2.5:
-                continue
-            unmoved = np.inf
-            for shift in (np.zeros(3), floor):
-                v = turned * scale + shift
-                # A garment too small by a unit lies close to the skin, but within it.
-                score = misfit(v, 0.015)
-                # Legs are near whatever hangs askew about them: what stands on the floor
-                # fits far better there than about the origin.
-                if shift.any() and score > _CLEARLY * unmoved:
-                    continue
-                unmoved = score
-                if score < best[0] - 1e-9:
-                    best = (score, v, unit, up)
-    score, v, unit, up = best
-    if score > 0.12:
-        size = np.ptp(vertices, axis=0)
-        raise MeshError(
-            f"{path}: no unit and up axis puts this mesh on the body: it measures"
-            f" {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} and stays"
-            f" {score:.2f} m away on average. Have it scaled and moved (physxnet fit"
-            f" {path} --like top, bottom or dress), or move it onto the body at rest, which"
-            " physxnet rest writes (A-pose, Y up, origin in the pelvis), and export again."
-        )
-    return v, unit, up
-
-
-def skin_misfit(skin: TriMesh) -> Callable[[Float[np.ndarray, "vertices 3"], float], float]:
-    """How badly vertices fit the body [m]: their mean distance, and how many lie deeper than so."""
-    points = np.asarray(skin.vertices)
-    normals = np.asarray(vertex_normals(skin.vertices, skin.faces))
-    tree = KDTree(points)
-
-    def misfit(vertices: Float[np.ndarray, "vertices 3"], deep: float) -> float:
-        distance, nearest = tree.query(vertices)
-        depth = np.einsum("ij,ij->i", points[nearest] - vertices, normals[nearest])
-        return float(np.mean(distance)) + 0.2 * float(np.mean(depth > deep))
-
-    return misfit
 
 
 def guess_template(
@@ -312,12 +244,3 @@ def _has_legs(v: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 
         if np.mean(part == k) > _LEG_SHARE
     ]
     return bool(sides) and min(sides) < -_ASIDE and max(sides) > _ASIDE
-
-
-def _smooth_far(weights: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> np.ndarray:
-    """Skinning weights averaged over the mesh where the skin is far away."""
-    average = smoothing_matrix(faces, len(weights))
-    share = np.clip((distance - 0.02) / 0.04, 0.0, 1.0)[:, None]
-    for _ in range(60):
-        weights = weights + share * (average @ weights - weights)
-    return weights / weights.sum(axis=1, keepdims=True)

@@ -29,10 +29,10 @@ from ._garment import (
     guess_template,
     hangs_off,
     load_garment,
-    place_on_body,
 )
 from ._like import place_like
 from ._mesh_file import mesh_name, read_mesh
+from ._place import place_on_body
 
 # Shares and lengths beyond which a garment is worth a word [1], [m].
 _INSIDE, _FINE, _MISSED = 0.02, 0.003, 0.1
@@ -113,7 +113,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     skin = body.rest_mesh()
     problems, notes, options = [], [], []
     try:
-        v, unit, up = place_on_body(path, raw.vertices, body)
+        v, unit, up, posed = place_on_body(path, raw.vertices, body, raw.faces)
     except MeshError as error:
         problems.append(str(error).partition(": ")[2])
         # The template whose place it fills best; the user may know better.
@@ -191,6 +191,8 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
                 f"made of {len(raw.parts)} meshes ({', '.join(raw.parts)[:200]}): `{path}#NAME`"
                 " takes one of them."
             )
+    if posed:
+        notes.append("made for a T-pose: worn as it is, its sleeves are turned down with the arms.")
     if health.components > 1:
         notes.append(f"{health.components} parts that nothing joins: each moves by itself.")
     if hit_rate < 1 - _MISSED:
@@ -212,7 +214,7 @@ def _kinds(path: pathlib.Path, parts: tuple[str, ...], body: Body) -> dict[str, 
     for name in parts[:_MOST_PARTS]:
         mesh = read_mesh(f"{path}#{name}")
         with contextlib.suppress(MeshError):
-            v, _, _ = place_on_body(path, mesh.vertices, body)
+            v, *_ = place_on_body(path, mesh.vertices, body, mesh.faces)
             if np.ptp(v, axis=0).max() > _GARMENT:
                 found[name] = guess_template(v, mesh.faces)
     return found

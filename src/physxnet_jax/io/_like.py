@@ -4,7 +4,7 @@ import numpy as np
 
 from ..garment import Garment, clearance
 from ..geometry import TriMesh
-from ._garment import UNITS, skin_misfit
+from ._place import UNITS, skin_misfit
 
 # Sizes within which meshes are alike, and what turning one has to gain [m].
 _UNLIKE, _TURNED = 0.1, 0.001

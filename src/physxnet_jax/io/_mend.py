@@ -3,6 +3,7 @@
 import pathlib
 from collections.abc import Callable
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..body import Body, load_body
@@ -21,14 +22,17 @@ from ..garment import (
 )
 from ..geometry import Polygons, TriMesh, make_mesh
 from ._drape import drape
-from ._garment import NEAREST, carried, guess_template, place_on_body
+from ._garment import NEAREST, carried, guess_template
 from ._inspect import Inspection, inspect_garment
 from ._like import place_like
 from ._mesh_file import read_mesh
 from ._obj import write_materials, write_obj
+from ._place import place_on_body
 
 # Lifting ends a little short of what it aims at.
 _LIFT = 1.3
+# How often edges that lifting stretched are split again.
+_ROUNDS = 5
 
 
 def fit_garment(
@@ -74,8 +78,10 @@ def fit_garment(
     skin = body.rest_mesh()
     done = []
     if like is None:
-        v, unit, up = place_on_body(path, raw.vertices, body)
+        v, unit, up, posed = place_on_body(path, raw.vertices, body, raw.faces)
         done.append(f"read as {unit}, {up} up.")
+        if posed:
+            done.append("brought from the T-pose that it was made for to the body's rest pose.")
     else:
         v, told, _ = place_like(raw.vertices, template(like), skin)
         done.append(told)
@@ -103,15 +109,12 @@ def fit_garment(
             lost = ", without its texture coordinates" if textured else ""
             done.append(f"decimated {count:,} faces to {mesh.faces.shape[0]:,}{lost}.")
     count = int(mesh.faces.shape[0])
-    if edge_length is not None:
-        mesh = subdivide(mesh, edge_length)
-        if int(mesh.faces.shape[0]) > count:
-            done.append(f"split {count:,} faces into {mesh.faces.shape[0]:,}.")
-    moved, low = lift_out(
-        skin, np.asarray(mesh.vertices), np.asarray(mesh.faces), _LIFT * NEAREST, iterations=12
-    )
-    if low.any():
-        done.append(f"lifted {int(low.sum()):,} vertices out of the body or off it.")
+    mesh, low = _split_and_lifted(mesh, skin, edge_length)
+    moved = np.asarray(mesh.vertices)
+    if int(mesh.faces.shape[0]) > count:
+        done.append(f"split {count:,} faces into {mesh.faces.shape[0]:,}.")
+    if low:
+        done.append(f"lifted {low:,} vertices out of the body or off it.")
     if draped:
         kind = guess_template(moved, np.asarray(mesh.faces)) if like is None else like
         # Lifted over what it will slide down from, its edges are longer than it was made.
@@ -127,6 +130,29 @@ def fit_garment(
             done.append("polygons are triangles now.")
     _write(out, mesh.replace(vertices=moved), drawn)
     return done, inspect_garment(out, body=body)
+
+
+def _split_and_lifted(
+    mesh: TriMesh, skin: TriMesh, edge_length: float | None
+) -> tuple[TriMesh, int]:
+    """The mesh out of the body, its edges split; and how many vertices lay in it.
+
+    Lifting stretches edges, which are split again, and the halves lie lower than their ends.
+    """
+    count = 0
+    for again in range(_ROUNDS):
+        if edge_length is not None:
+            finer = subdivide(mesh, edge_length)
+            if again and finer.faces.shape == mesh.faces.shape:
+                break
+            mesh = finer
+        x, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+        moved, low = lift_out(skin, x, faces, _LIFT * NEAREST, iterations=12)
+        count = max(count, int(low.sum()))
+        mesh = mesh.replace(vertices=jnp.asarray(moved, jnp.float32))
+        if edge_length is None or not low.any():
+            break
+    return mesh, count
 
 
 def _write(out: pathlib.Path, mesh: TriMesh, drawn: Polygons | None) -> None:
