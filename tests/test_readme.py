@@ -44,7 +44,7 @@ def test_the_table_is_the_measured_one():
     rows = json.loads((ROOT / "experiments/results/test_errors.json").read_text())
     made = runpy.run_path(str(ROOT / "experiments/reproduce.py"))
     table = made["short_table"]([ActionError(**r) for r in rows])
-    assert "| local |" in table and table.strip() in TEXT
+    assert "| `local` |" in table and table.strip() in TEXT
 
 
 def test_the_python_examples_run(tmp_path, monkeypatch):

@@ -375,7 +375,7 @@ def test_a_garment_made_for_a_t_pose_is_brought_to_the_rest_pose(name, tmp_path,
         and np.quantile(np.linalg.norm(posed - x, axis=1), 0.95) > 0.05
     )
     assert any("T-pose" in note for note in inspect_garment(path).notes)
-    done, after = fit_garment(path, tmp_path / "rest.obj")
+    done, _ = fit_garment(path, tmp_path / "rest.obj")
     assert any("T-pose" in d for d in done)
     assert not load_garment(tmp_path / "rest.obj")[1].posed
     # The control: what lies on the body at rest stays as it is.
