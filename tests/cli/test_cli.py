@@ -92,7 +92,7 @@ def test_dress_writes_and_reports(tmp_path, capsys, method):
     ]
     assert main(words) == 0
     text = capsys.readouterr().out
-    assert "20 frames at 30 fps" in text and "inside body" in text
+    assert "20 frames at 30 fps" in text and "inside the body" in text
     with np.load(out) as data:
         assert data["top_positions"].shape == (20, 3301, 3)
         assert np.isfinite(data["bottom_positions"]).all()

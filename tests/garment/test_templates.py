@@ -59,6 +59,22 @@ def test_the_asset_is_what_the_code_cuts():
         assert np.mean(gap > 2e-5) < 0.03 and gap.max() < 5e-3, key
 
 
+def test_a_top_lies_over_trousers_at_rest():
+    """Edges of the one cut no triangle of the other; pressed through it would."""
+    top, trousers = template("top").mesh, template("bottom").mesh
+    count = len(trousers.vertices)
+    faces = np.concatenate([np.asarray(trousers.faces), np.asarray(top.faces) + count])
+
+    def cuts(over):
+        v = np.concatenate([np.asarray(trousers.vertices), over])
+        pairs = self_intersections(v.astype(np.float64), faces)
+        edges = mesh_edges(faces).vertices[pairs[:, 0], 0] < count
+        return int(np.sum(edges != (pairs[:, 1] < len(trousers.faces))))
+
+    x = np.asarray(top.vertices)
+    assert cuts(x) == 0 and cuts(x * np.float32([0.97, 1.0, 0.9])) > 50
+
+
 def test_unknown_templates_are_refused():
     from physxnet_jax.io import load_garment
 

@@ -20,14 +20,15 @@ def closing_table(clip: DressedClip) -> list[Table]:
     for stage in clip.stages:
         warm = "" if stage.warm_ms is None else f"{stage.warm_ms:.2f}"
         times.add_row(stage.name, f"{stage.cold_ms:.0f}", warm)
-    fit = Table(title="garments", title_justify="left")
+    fit = Table(title="garments, and how much of them is inside the body", title_justify="left")
     for name in (
         "garment",
         "vertices",
-        "ray hit rate",
+        "rays hit",
         "fallbacks",
-        "inside body (raw)",
-        "inside body",
+        "inside, raw",
+        "inside",
+        "worst frame",
     ):
         fit.add_column(name, justify="left" if name == "garment" else "right")
     for m in clip.garments:
@@ -38,6 +39,7 @@ def closing_table(clip: DressedClip) -> list[Table]:
             "-" if clip.fallbacks[m.name] is None else str(clip.fallbacks[m.name]),
             _share(clip.inside_raw[m.name], 2),
             _share(clip.inside[m.name], 2),
+            _worst(clip, m.name),
         )
     return [times, fit]
 
@@ -57,11 +59,20 @@ def report(clip: DressedClip) -> dict[str, Any]:
                 "fallbacks": clip.fallbacks[m.name],
                 "inside_raw": clip.inside_raw[m.name],
                 "inside": clip.inside[m.name],
+                "worst_frame": clip.worst[m.name][0] if m.name in clip.worst else None,
+                "inside_worst": clip.worst[m.name][1] if m.name in clip.worst else None,
             }
             for m in clip.garments
         ],
         "notes": list(clip.notes),
     }
+
+
+def _worst(clip: DressedClip, name: str) -> str:
+    if name not in clip.worst:
+        return "-"
+    frame, share = clip.worst[name]
+    return f"{100 * share:.1f} % ({frame})"
 
 
 def _share(value: float | None, digits: int) -> str:

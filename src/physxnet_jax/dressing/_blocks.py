@@ -153,9 +153,10 @@ def simulate_clip(
     return dict(zip([g.name for g in order], rollout.positions, strict=True))
 
 
-def inside_share(
+def inside_shares(
     patch: SkinPatch, positions: np.ndarray, world: np.ndarray, shift: np.ndarray
-) -> float:
+) -> Float[np.ndarray, " frames"]:
+    """Share of a garment's vertices below the skin near them, in every frame."""
     shares = []
     for start in range(0, len(positions), BLOCK):
         height = _heights(
@@ -165,7 +166,7 @@ def inside_share(
             padded_block(shift, start, 0),
         )
         shares.append(np.asarray(height < 0)[: len(positions) - start].mean(axis=1))
-    return float(np.concatenate(shares).mean())
+    return np.concatenate(shares)
 
 
 @jax.jit

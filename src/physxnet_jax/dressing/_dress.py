@@ -18,7 +18,7 @@ from ..models import Predictor, Wearable, fold_batch_norm, make_surface, make_we
 from ..motion import Motion, before_transforms, clip_transforms, sudden_turns
 from ..simulation import ACCURACY
 from ..uv import Binding, Transference, bind
-from ._blocks import inside_share, lead_frames, lift_clip, predict_clip, simulate_clip
+from ._blocks import inside_shares, lead_frames, lift_clip, predict_clip, simulate_clip
 from ._character import (
     Character,
     clear_of_character,
@@ -53,6 +53,8 @@ class DressedClip:
             person's own surface, from which cloth is then moved.
         method: How the cloth was made.
         notes: What the reader should know about it.
+        worst: For each garment by name the frame in which most of it is inside the body,
+            and how much; empty on a person of one's own.
     """
 
     meshes: tuple[AnimatedMesh, ...]
@@ -64,6 +66,7 @@ class DressedClip:
     inside: dict[str, float]
     method: str
     notes: tuple[str, ...] = ()
+    worst: dict[str, tuple[int, float]] = dataclasses.field(default_factory=dict)
 
     @property
     def garments(self) -> tuple[AnimatedMesh, ...]:
@@ -190,10 +193,12 @@ def dress(
             stages,
             progress,
         )
-    inside = {
-        w.name: inside_share(p, positions[w.name], world, shift)
+    each = {
+        w.name: inside_shares(p, positions[w.name], world, shift)
         for w, p in zip(wearables, patches, strict=True)
     }
+    inside = {name: float(shares.mean()) for name, shares in each.items()}
+    worst = {name: (int(x.argmax()), float(x.max())) for name, x in each.items()}
     with watch("body"):
         if person is not None:
             positions = {g.name: follow_leftover(g, person, positions[g.name]) for g in garments}
@@ -207,6 +212,7 @@ def dress(
                 # What was moved off the person's skin may have moved through what is over it.
                 positions = lift_clip(layers, wearables, positions)
             inside = {g.name: inside_character(person, positions[g.name]) for g in garments}
+            worst = {}
         meshes = animated_meshes(body, clip, shape, garments, positions, include_body)
         if person is not None and include_body:
             whole = dataclasses.replace(
@@ -227,6 +233,7 @@ def dress(
             *(() if person is None else person.notes),
             *notes,
         ),
+        worst,
     )
 
 

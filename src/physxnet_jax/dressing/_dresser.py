@@ -127,6 +127,9 @@ def make_dresser(
             beneath them.
         precision: Of the network's arithmetic; all else stays float32.
 
+    Returns:
+        What `clothe` and `clothe_frame` take: a pytree.
+
     Raises:
         PhysXNetError: Anything that can't be read or bound; the text says why.
     """
@@ -157,6 +160,9 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
     Args:
         dresser: From `make_dresser`.
         shape: Shape parameters, see `Body.shape`.
+
+    Returns:
+        The dresser for that shape.
 
     Raises:
         ValueError: Another number of parameters; a dress by a network of the paper's

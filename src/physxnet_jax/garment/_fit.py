@@ -12,6 +12,7 @@ from ..geometry import (
     TriMesh,
     boundary_loops,
     closest_among,
+    closest_points,
     mesh_edges,
     nearby_faces,
     self_intersections,
@@ -210,6 +211,46 @@ def smoothing_matrix(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> sp
     degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1)
     eye = sp.identity(num_vertices, format="csr")
     return sp.csr_matrix(0.5 * eye + 0.5 * sp.diags(1 / degree) @ graph)
+
+
+def lift_over(
+    under: TriMesh,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    gap: float,
+    *,
+    passes: int = 30,
+) -> Float[np.ndarray, "vertices 3"]:
+    """A garment that lies over another one, at rest.
+
+    What lies lower than the gap over it, or up to 3 cm beneath it, is lifted along its
+    normals: smoothly first, exactly at last. Beyond its borders nothing is.
+
+    Args:
+        under: The garment beneath.
+        vertices: Of the one over it [m].
+        faces: Its triangles.
+        gap: Wanted height [m].
+        passes: Steps; each lifts by what is lacking then.
+    """
+    v = np.asarray(vertices, np.float64).copy()
+    average = smoothing_matrix(faces, len(v))
+    normals = np.asarray(vertex_normals(under.vertices, under.faces), np.float64)
+    skin, triangles = np.asarray(under.vertices, np.float64), np.asarray(under.faces)
+    for step in range(passes):
+        hit = closest_points(under, jnp.asarray(v, jnp.float32))
+        corners, share = triangles[np.asarray(hit.face)], np.asarray(hit.weights, np.float64)
+        foot = np.einsum("pk,pkc->pc", share, skin[corners])
+        up = np.einsum("pk,pkc->pc", share, normals[corners])
+        up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
+        height = np.einsum("pc,pc->p", v - foot, up)
+        beside = np.linalg.norm(v - foot - height[:, None] * up, axis=1)
+        lack = np.where((beside < 2e-3) & (height > -0.03), np.maximum(gap - height, 0.0), 0.0)
+        if step < passes - 6:
+            near = (height < 0.03) & (beside < 0.01)
+            lack = np.where(near, 1.5 * (average @ (average @ lack)), 0.0)
+        v += lack[:, None] * up
+    return v
 
 
 def level_hem(

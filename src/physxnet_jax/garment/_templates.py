@@ -19,6 +19,7 @@ from ._fit import (
     clearance,
     level_hem,
     lift_out,
+    lift_over,
     relax_crossings,
     set_clearance,
 )
@@ -38,6 +39,8 @@ _MAX_EDGE = 0.031
 _FARTHEST = 0.019
 # Clearance of a hem that was levelled [m].
 _HEM_GAP = 0.0065
+# Height of the top over the trousers where both are [m].
+_OVER_TROUSERS = 0.005
 ASSET = "templates_cc0.npz"
 
 
@@ -93,6 +96,9 @@ def build_template(name: Template, body: Body | None = None) -> Garment:
     if name == "top":
         # Over the hollow behind it was drawn up.
         vertices = _levelled(mesh, vertices, piece.faces)
+        # Both hug the skin where their hems overlap: over trousers it is worn.
+        under = build_template("bottom", body).mesh
+        vertices = lift_over(under, vertices, piece.faces, _OVER_TROUSERS)
     pinned = np.zeros(len(vertices), dtype=bool)
     if name == "bottom":
         loops = boundary_loops(piece.faces)
@@ -116,6 +122,15 @@ def _levelled(
 @functools.cache
 def template(name: Template) -> Garment:
     """A template garment from the package, see `build_template`.
+
+    Args:
+        name: ``top``, ``bottom`` or ``dress``.
+
+    Returns:
+        The garment at rest on the built-in body's default shape.
+
+    Raises:
+        MeshError: Another name.
 
     Example:
         >>> template("bottom").mesh.vertices.shape[1]

@@ -103,6 +103,9 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         path: A file that `read_mesh` reads.
         body: The body; the built-in one by default.
 
+    Returns:
+        What was found, and the command that mends it.
+
     Raises:
         FormatError: A file that can't be read.
     """

@@ -50,7 +50,7 @@ def check_output(path: str | pathlib.Path, frames: int | None = None) -> pathlib
 def write_clip(
     path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float
 ) -> list[pathlib.Path]:
-    """Writes a clip; returns the files written.
+    """Writes a clip.
 
     ``.usdc``, ``.usd``, ``.usda``: one stage. ``.glb``: glTF with a morph target a frame.
     ``.html``: a page that plays it.
@@ -59,6 +59,14 @@ def write_clip(
     and ``STEM_NAME.obj``. ``.obj``: a file for each mesh and frame, ``STEM_NAME_0000.obj``;
     what follows their numbers, of a longer clip before, is removed. Where a mesh has
     materials, ``STEM_NAME.mtl`` is beside them.
+
+    Args:
+        path: Where to; its ending says in which format.
+        meshes: What to write [m], Y up; all of the same number of frames.
+        fps: Frames a second.
+
+    Returns:
+        The files written.
 
     Raises:
         FormatError: Another extension, or too many frames for glTF.

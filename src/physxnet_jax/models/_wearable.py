@@ -74,6 +74,9 @@ def make_wearable(
         rest: `Body.rest_vertices` of that shape [m].
         garment: What is worn.
         binding: Of its vertices to an atlas, see `bind`.
+
+    Returns:
+        The garment as `dress_frames` takes it.
     """
     base, radius = rest, _SMOOTH
     if garment.template == "dress":
@@ -184,7 +187,15 @@ def dress_frames(
 
 
 def pad_clip(values: Float[Array, "frames ..."], inputs: Inputs) -> Float[Array, "padded ..."]:
-    """A clip with its first frame repeated before itself, as often as ``inputs`` need."""
+    """A clip with its first frame repeated before itself, as often as ``inputs`` need.
+
+    Args:
+        values: Of each frame: joints' rotations, or their translations.
+        inputs: What the network sees.
+
+    Returns:
+        ``inputs.window - 1`` frames more: of a person who stood still until the first one.
+    """
     return jnp.concatenate([jnp.repeat(values[:1], inputs.window - 1, axis=0), values])
 
 

@@ -34,7 +34,12 @@ def velocity_maps(
 def acceleration_maps(
     points: Float[Array, "frames texels 3"], fps: float
 ) -> Float[Array, "frames texels 3"]:
-    """I_a[k] = I_v[k] - I_v[k-1], in m/s^2 (PhysXNet, equation 7)."""
+    """I_a[k] = I_v[k] - I_v[k-1], in m/s^2 (PhysXNet, equation 7).
+
+    Args:
+        points: Texels' positions [m], not their velocities: these are computed here.
+        fps: Frames a second.
+    """
     velocity = velocity_maps(points, fps)
     before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
     return (velocity - before) * fps
