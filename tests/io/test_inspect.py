@@ -394,3 +394,24 @@ def test_edges_are_as_short_as_asked_for_whatever_lifting_does(tmp_path):
     assert "--edge-length 20" in inspect_garment(path).command
     _, after = fit_garment(path, tmp_path / "b.obj", edge_length=0.02)
     assert after.health.longest_edge < 0.025 and after.command is None
+
+
+def test_a_cape_in_metres_is_taken_as_it_is(tmp_path, body):
+    skin = np.asarray(body.rest_mesh().vertices)
+    back = skin[(np.abs(skin[:, 0]) < 0.03) & (np.abs(skin[:, 1] - 0.4) < 0.02), 2].min()
+    u, t = (a.ravel() for a in np.meshgrid(np.linspace(-0.2, 0.2, 21), np.linspace(0, 1, 41)))
+    far = np.where(t < 0.15, 0.0, t - 0.15)
+    cape = np.stack([u * (1 + t), 0.42 - t, back - 0.012 - 0.6 * far], axis=1)
+    k = np.arange(40 * 21).reshape(40, 21)[:, :-1].ravel()
+    faces = np.concatenate([np.stack([k, k + 1, k + 22], 1), np.stack([k, k + 22, k + 21], 1)])
+    garment, report = load_garment(saved(tmp_path, "cape.obj", cape, faces))
+    assert report.unit == "m" and not report.posed
+    assert np.abs(np.asarray(garment.mesh.vertices) - cape).max() < 0.01
+    # The control: as far off, and nothing of it touches the body.
+    with pytest.raises(MeshError, match="no unit and up axis"):
+        load_garment(saved(tmp_path, "far.obj", cape - [0.0, 0.0, 0.2], faces))
+    # What hangs on by a sleeve is taken, too, and sent to its place.
+    top = template("top").mesh
+    x = np.asarray(top.vertices) + np.float32([0.5, 0.0, 0.0])
+    found = inspect_garment(saved(tmp_path, "top.obj", x, np.asarray(top.faces)))
+    assert "--like top" in found.command

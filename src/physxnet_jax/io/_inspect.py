@@ -233,7 +233,8 @@ def _elsewhere(
     there, _ = clearance(skin, np.asarray(placed, np.float32))
     now, then = (float(np.mean(x < NEAREST)) for x in (distance, there))
     nearer = float(np.mean(np.abs(there))) < _NEARER * float(np.mean(np.abs(distance)))
-    if then > (0.7 if nearer else 0.25) * now:
+    better = then <= max(0.7 * now, _INSIDE) if nearer else then <= 0.25 * now and now > ELSEWHERE
+    if not better:
         return None
     return name, f"{told.rstrip('.')}, it has {100 * then:.1f} % of its vertices in the body."
 

@@ -22,6 +22,8 @@ _CLEARLY = 0.6
 # Misfits: of what is as it should be, of what is elsewhere [m]; and how much better a garment
 # that was made for a T-pose fits there [1].
 _WELL, _FARTHEST, _POSED = 0.015, 0.12, 0.75
+# So near to the skin is what holds a cape [m].
+_TOUCHES = 0.03
 
 
 class Placement(NamedTuple):
@@ -69,6 +71,8 @@ def place_on_body(
             score, v, unit, up = other
             if score <= _FARTHEST:
                 return Placement(_unposed(v, faces, body, pose), unit, up, True)
+    if score > _FARTHEST and _hangs_free(vertices, body.rest_mesh()):
+        return Placement(np.asarray(vertices, np.float64), "m", "Y")
     if score > _FARTHEST:
         size = np.ptp(vertices, axis=0)
         raise MeshError(
@@ -79,6 +83,17 @@ def place_on_body(
             " physxnet rest writes (A-pose, Y up, origin in the pelvis), and export again."
         )
     return Placement(v, unit, up)
+
+
+def _hangs_free(vertices: Float[np.ndarray, "vertices 3"], mesh: TriMesh) -> bool:
+    """Whether a mesh in metres hangs from the body, as a cape does, far from it elsewhere."""
+    if not 0.1 < np.ptp(vertices, axis=0).max() < 2.5:
+        return False
+    points = np.asarray(mesh.vertices)
+    normals = np.asarray(vertex_normals(mesh.vertices, mesh.faces))
+    distance, nearest = KDTree(points).query(vertices)
+    out = np.einsum("vc,vc->v", vertices - points[nearest], normals[nearest])
+    return bool(np.quantile(distance, 0.05) < _TOUCHES and np.mean(out < 0) < 0.05)
 
 
 def _best_place(
