@@ -114,6 +114,7 @@ def main() -> None:
         "unseen",
         "mirrored_answer",
         "cloth_memory",
+        "clip_start",
         "previous_offset",
         "accuracy_cost",
         "frames_seen",

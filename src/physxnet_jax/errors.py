@@ -42,18 +42,6 @@ class BrokenInstallError(PhysXNetError, RuntimeError):
     """The installed jaxlib is known to compute wrong numbers."""
 
 
-__all__ = [
-    "BrokenInstallError",
-    "FormatError",
-    "MeshError",
-    "MissingDependencyError",
-    "MotionError",
-    "PhysXNetError",
-    "SimulationError",
-    "WeightsError",
-]
-
-
 def check_numbers(owner: object, *names: str, zero: bool = False) -> None:
     """Fails unless attributes of settings are finite and positive; None is left out.
 
@@ -85,3 +73,17 @@ def check_counts(owner: object, *names: str) -> None:
         value = getattr(owner, name)
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
             raise ValueError(f"{name} is {value}, expected a whole number from 1 up")
+
+
+__all__ = [
+    "BrokenInstallError",
+    "FormatError",
+    "MeshError",
+    "MissingDependencyError",
+    "MotionError",
+    "PhysXNetError",
+    "SimulationError",
+    "WeightsError",
+    "check_counts",
+    "check_numbers",
+]

@@ -191,7 +191,6 @@ def test_skeleton_and_rate_reach_the_reader(command, tmp_path, monkeypatch):
 
     monkeypatch.setattr("physxnet_jax.motion.load_motion", read)
     monkeypatch.setattr("physxnet_jax.dressing._wanted_clip.load_motion", read)
-    monkeypatch.setattr("physxnet_jax.viewer._job.load_motion", read)
     words = ["--skeleton", "b.asf", "--source-fps", "60"]
     words += ["--html", str(tmp_path / "a.html")] if command == "view" else []
     assert main([command, "a.amc", *words]) == 2
@@ -266,3 +265,6 @@ def test_work_that_would_be_lost_is_told_of_before_it_is_done(capsys, tmp_path):
     late = np.load(tmp_path / "a.npz")["bottom_positions"]
     whole = dress("walk", ["bottom"], method="lbs", frames=32).garments[0].positions
     np.testing.assert_allclose(late, whole[30:32], atol=1e-6)
+    # A start within the last frame is that frame.
+    assert main([*words, "-o", str(tmp_path / "b.npz"), "--start", "3.99"]) == 0
+    assert np.load(tmp_path / "b.npz")["bottom_positions"].shape[0] == 1

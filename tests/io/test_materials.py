@@ -166,3 +166,17 @@ def test_what_a_material_file_cannot_tell_is_not_told(quilted):
     quilted.write_text(text.replace("cloth.mtl", "../secret.mtl"))
     p = read_obj(quilted).polygons
     assert p is not None and p.materials[1].colour is None
+
+
+def test_faces_without_a_material_do_not_take_their_neighbours(quilted, tmp_path):
+    mesh = worn(quilted)
+    assert mesh.polygons is not None
+    bare = mesh.polygons.material.copy()
+    bare[len(bare) // 3 : len(bare) // 2] = -1
+    mesh = dataclasses.replace(mesh, polygons=dataclasses.replace(mesh.polygons, material=bare))
+    write_clip(tmp_path / "a.obj", [mesh], 30.0)
+    back = read_obj(tmp_path / "a_quilted_0000.obj").polygons
+    assert back is not None
+    names = [back.materials[k].name for k in back.material]
+    wanted = ["default" if k < 0 else mesh.polygons.materials[k].name for k in bare]
+    assert names == wanted and len(set(names)) == 3

@@ -62,3 +62,4 @@ from ._scene_file import (
 )
 from ._skirt import SkirtPatch as SkirtPatch
 from ._stages import Stage as Stage
+from ._wanted_clip import wanted_clip as wanted_clip

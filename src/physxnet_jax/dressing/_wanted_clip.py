@@ -72,6 +72,6 @@ def wanted_clip(
         )
     if first == 0 and frames is None:
         return clip
-    begin = round(first)
+    begin = min(round(first), clip.num_frames - 1)
     kept = slice(begin, None if frames is None else begin + frames)
     return dataclasses.replace(clip, rotations=clip.rotations[kept], root=clip.root[kept])

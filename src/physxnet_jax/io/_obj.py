@@ -14,6 +14,7 @@ from ._clip import StillMesh
 
 _MAX_BYTES = 500_000_000
 _MAX_LIBRARY = 5_000_000
+_NONE = "default"
 
 
 def read_obj(path: str | pathlib.Path, part: str | None = None) -> StillMesh:
@@ -193,8 +194,9 @@ def write_obj(
     for start, count, which in zip(
         polygons.starts, polygons.counts, polygons.material, strict=True
     ):
-        if which != used and which >= 0:
-            lines.append(f"usemtl {polygons.materials[which].name}")
+        if which != used:
+            # What has none would otherwise be taken for what was before it.
+            lines.append(f"usemtl {polygons.materials[which].name if which >= 0 else _NONE}")
         used = which
         lines.append("f " + " ".join(words[start : start + count]))
     with whole_file(path) as part:

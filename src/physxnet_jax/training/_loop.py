@@ -1,6 +1,5 @@
 """The training loop: resumable, logged, and ending in a predictor."""
 
-import dataclasses
 import itertools
 import json
 import pathlib
@@ -204,7 +203,7 @@ def _same_run(path: pathlib.Path, text: str) -> None:
     """Notes what a run is, or refuses to go on with another one in its folder."""
     if path.is_file():
         # What a run begun by an earlier version doesn't say was as it is by default.
-        before = _filled(json.loads(path.read_text()), dataclasses.asdict(TrainConfig()))
+        before = _filled(json.loads(path.read_text()), json.loads(config_json(TrainConfig(), "")))
         now = json.loads(text)
         changed = [k for k in now if before.get(k) != now[k]]
         if changed:
@@ -219,13 +218,8 @@ def _same_run(path: pathlib.Path, text: str) -> None:
 
 def _filled(told: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
     """Settings, with what isn't among them as it is by default."""
-    told = {**{k: v for k, v in usual.items() if k not in told}, **told}
-    inner = {
-        k: _filled(v, usual[k])
-        for k, v in told.items()
-        if isinstance(v, dict) and isinstance(usual.get(k), dict)
-    }
-    return json.loads(json.dumps({**told, **inner}))
+    inner = {k: _filled(told.get(k, {}), v) for k, v in usual.items() if isinstance(v, dict)}
+    return {**usual, **told, **inner}
 
 
 def make_predictor(

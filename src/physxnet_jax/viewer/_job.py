@@ -12,12 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..body import load_body
-from ..dressing import animated_meshes, dress, fit_surface, load_ladder, make_scene
+from ..dressing import (
+    animated_meshes,
+    dress,
+    fit_surface,
+    load_ladder,
+    make_scene,
+    wanted_clip,
+)
 from ..errors import PhysXNetError
 from ..garment import FABRICS
 from ..io import DEFAULT, AnimatedMesh, load_predictor, read_card
 from ..models import Predictor
-from ..motion import BLOCK, Motion, clip_transforms, load_motion, stand_on_floor
+from ..motion import BLOCK, Motion, clip_transforms, stand_on_floor
 from ..simulation import ACCURACY, Air, Effect, SelfContact, prepare_scene, simulate_batch
 from ._live import Live
 from ._maps import frame_maps
@@ -154,17 +161,15 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
     check_choice(choice)
     body = load_body()
     shape = _shape(choice)
-    clip = load_motion(
+    clip = wanted_clip(
         choice.motion,
         fps=choice.fps,
+        frames=choice.frames,
         source_fps=choice.source_fps,
         skeleton=choice.skeleton,
         joint_map=choice.joint_map,
         body=body,
         shape=shape,
-    )
-    clip = dataclasses.replace(
-        clip, rotations=clip.rotations[: choice.frames], root=clip.root[: choice.frames]
     )
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     if shape is not None:
