@@ -160,7 +160,7 @@ def test_faces_are_turned_outwards_whatever_their_sense(seed, share):
 
 def test_subdivision_keeps_shape_and_texture_and_has_an_end():
     for longest in (0.6, 0.4, 0.2):
-        fine = subdivide(sheet(3), longest)
+        fine, part_of = subdivide(sheet(3), longest)
         h = mesh_health(fine)
         assert h.longest_edge <= longest and h.components == 1
         assert h.openings == pytest.approx((4.0,)) and textured(fine) < 1e-6
@@ -169,12 +169,20 @@ def test_subdivision_keeps_shape_and_texture_and_has_an_end():
         double = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         assert len(np.unique(np.sign(double[:, 2]))) == 1
         assert np.abs(double[:, 2]).sum() / 2 == pytest.approx(1.0)
+        # Each is a part of the face that it says, and all of them together are that face.
+        whole = np.asarray(sheet(3).vertices)[np.asarray(sheet(3).faces)]
+        weights = np.linalg.solve(
+            np.concatenate([whole[part_of, :, :2].swapaxes(1, 2), np.ones((h.faces, 1, 3))], 1),
+            np.concatenate([corners.mean(axis=1)[:, :2], np.ones((h.faces, 1))], 1)[..., None],
+        )
+        assert (weights > 0).all()
+        np.testing.assert_allclose(np.bincount(part_of, double[:, 2]), 0.25, rtol=1e-5)
     # One long edge splits no other.
     thin = make_mesh(
         np.array([[0, 0, 0], [1, 0, 0], [1, 0.1, 0], [0, 0.1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
     )
-    assert mesh_health(subdivide(thin, 0.6)).vertices == 7
-    assert subdivide(sheet(3), 10.0).faces.shape == sheet(3).faces.shape
+    assert mesh_health(subdivide(thin, 0.6)[0]).vertices == 7
+    assert subdivide(sheet(3), 10.0)[0].faces.shape == sheet(3).faces.shape
     with pytest.raises(MeshError, match="Choose a longer one"):
         subdivide(sheet(3), 1e-4)
 

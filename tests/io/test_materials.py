@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from physxnet_jax import fit_garment, template
 from physxnet_jax.io import AnimatedMesh, load_garment, read_mesh, read_obj, write_clip, write_obj
@@ -122,12 +123,25 @@ def test_a_fitted_garment_keeps_them(quilted, tmp_path):
     before, after = read_obj(quilted).polygons, read_obj(tmp_path / "fitted.obj").polygons
     assert before is not None and after is not None and rings(after) == rings(before)
     assert after.materials == before.materials and "triangles" not in " ".join(done)
-    # Finer it has other faces.
+    # Finer it has other faces, each of the material of what it was cut from.
     done, _ = fit_garment(quilted, tmp_path / "finer.obj", edge_length=0.015)
-    finer = read_obj(tmp_path / "finer.obj").polygons
-    assert (
-        finer is not None and set(finer.counts) == {3} and done[-1] == "polygons are triangles now."
-    )
+    mesh, coarse = read_obj(tmp_path / "finer.obj"), read_obj(tmp_path / "fitted.obj")
+    finer = mesh.polygons
+    assert finer is not None and set(finer.counts) == {3}
+    assert done[-1] == "polygons are triangles now."
+    assert finer.materials == before.materials and len(mesh.faces) > 2 * len(coarse.faces)
+    middle, whole = (m.vertices[m.faces].mean(axis=1) for m in (mesh, coarse))
+    of_face = after.material[after.of_triangle]
+    nearest = of_face[KDTree(whole).query(middle)[1]]
+    assert np.mean(finer.material == nearest) > 0.9
+
+
+def test_a_decimated_garment_says_that_materials_are_lost(quilted, tmp_path):
+    pytest.importorskip("fast_simplification")
+    done, _ = fit_garment(quilted, tmp_path / "coarse.obj", coarser=0.03)
+    assert any(d.startswith("materials are lost") for d in done)
+    p = read_obj(tmp_path / "coarse.obj").polygons
+    assert p is not None and p.materials == ()
 
 
 def test_a_fitted_garment_keeps_them_welded_and_turned_round(quilted, tmp_path):

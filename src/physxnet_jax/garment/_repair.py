@@ -145,8 +145,11 @@ def orient(mesh: TriMesh, body: TriMesh) -> TriMesh:
     return _remade(mesh, x, out, uv_faces)
 
 
-def subdivide(mesh: TriMesh, longest: float) -> TriMesh:
+def subdivide(mesh: TriMesh, longest: float) -> tuple[TriMesh, Int[np.ndarray, " finer"]]:
     """Edges split in the middle until none is longer than a length [m]; no other is touched.
+
+    Returns:
+        The mesh, and the face before that each of its faces is a part of, shape [finer].
 
     Raises:
         MeshError: It would take more than 400,000 vertices.
@@ -154,12 +157,13 @@ def subdivide(mesh: TriMesh, longest: float) -> TriMesh:
     x, faces = _arrays(mesh)
     uv = None if mesh.uv is None else np.asarray(mesh.uv, np.float64)
     chart = None if mesh.uv_faces is None else np.asarray(mesh.uv_faces, np.int64)
+    part_of = np.arange(len(faces))
     while True:
         edges = mesh_edges(faces)
         length = np.linalg.norm(x[edges.vertices[:, 0]] - x[edges.vertices[:, 1]], axis=1)
         long = length > longest
         if not long.any():
-            return make_mesh(x, faces, uv, chart)
+            return make_mesh(x, faces, uv, chart), part_of
         if len(x) + int(long.sum()) > _MOST:
             raise MeshError(
                 f"edges of {1e3 * longest:g} mm would take over {_MOST:,} vertices: the longest"
@@ -167,16 +171,17 @@ def subdivide(mesh: TriMesh, longest: float) -> TriMesh:
             )
         split = long[edges.of_face]
         if uv is not None and chart is not None:
-            uv, chart = _split(uv, chart, split)
-        x, faces = _split(x, faces, split)
+            uv, chart, _ = _split(uv, chart, split)
+        x, faces, cut = _split(x, faces, split)
+        part_of = part_of[cut]
 
 
 def _split(
     x: Float[np.ndarray, "points d"],
     faces: Int[np.ndarray, "faces 3"],
     split: Bool[np.ndarray, "faces 3"],
-) -> tuple[Float[np.ndarray, "more d"], Int[np.ndarray, "finer 3"]]:
-    """Triangles cut at the middles of chosen edges, each opposite to its corner."""
+) -> tuple[Float[np.ndarray, "more d"], Int[np.ndarray, "finer 3"], Int[np.ndarray, " finer"]]:
+    """Triangles cut at the middles of chosen edges, each opposite to its corner, and their rows."""
     edges = mesh_edges(faces)
     chosen = np.zeros(len(edges.vertices), dtype=bool)
     chosen[edges.of_face[split]] = True
@@ -184,7 +189,8 @@ def _split(
     number[chosen] = len(x) + np.arange(chosen.sum())
     x = np.concatenate([x, x[edges.vertices[chosen]].mean(axis=1)])
     middle = number[edges.of_face]
-    out = [faces[~split.any(axis=1)]]
+    row = np.arange(len(faces))
+    out, rows = [faces[~split.any(axis=1)]], [row[~split.any(axis=1)]]
     for k in range(3):
         # Corner k first; p and q follow, and m_k lies between p and q.
         turn = (k + np.arange(3)) % 3
@@ -192,12 +198,15 @@ def _split(
         mc, mp, mq = middle[:, turn].T
         one = split[:, turn[0]] & ~split[:, turn[1]] & ~split[:, turn[2]]
         out += [np.stack(t, 1)[one] for t in ((c, p, mc), (c, mc, q))]
+        rows += [row[one]] * 2
         two = ~split[:, turn[0]] & split[:, turn[1]] & split[:, turn[2]]
         out += [np.stack(t, 1)[two] for t in ((c, mq, mp), (mq, p, q), (mq, q, mp))]
+        rows += [row[two]] * 3
     every = split.all(axis=1)
     (a, b, c), (ma, mb, mc) = faces[every].T, middle[every].T
     out += [np.stack(t, 1) for t in ((a, mc, mb), (mc, b, ma), (mb, ma, c), (ma, mb, mc))]
-    return x, np.concatenate(out)
+    rows += [row[every]] * 4
+    return x, np.concatenate(out), np.concatenate(rows)
 
 
 def polygons_left(

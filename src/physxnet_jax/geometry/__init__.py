@@ -17,8 +17,10 @@ from ._normals import face_normals as face_normals, vertex_normals as vertex_nor
 from ._polygons import (
     Material as Material,
     Polygons as Polygons,
+    Texture as Texture,
     joined_polygons as joined_polygons,
     make_material as make_material,
+    make_texture as make_texture,
 )
 from ._raycast import RayHits as RayHits, cast_rays as cast_rays
 from ._rotation import (

@@ -12,30 +12,69 @@ from ..errors import MeshError
 
 
 @dataclasses.dataclass(frozen=True)
+class Texture:
+    """An image that colours faces by their texture coordinates.
+
+    Attributes:
+        name: What its file is called, without folders.
+        data: The file as it is, a PNG or a JPEG; None if it wasn't there or is neither.
+    """
+
+    name: str
+    data: bytes | None = dataclasses.field(default=None, repr=False)
+
+    @property
+    def ending(self) -> str:
+        """What its kind of file ends in: ``.png`` or ``.jpg``."""
+        return ".png" if self.data is None else _kind(self.data) or ".png"
+
+
+def make_texture(name: str, data: bytes | None) -> Texture:
+    """A texture as a file tells it; what is neither PNG nor JPEG is only named.
+
+    Args:
+        name: What its file is called; folders are left out.
+        data: The file; None if it can't be had.
+    """
+    name = name.replace("\\", "/").rpartition("/")[2]
+    return Texture(name, data if data is not None and _kind(data) else None)
+
+
+def _kind(data: bytes) -> str | None:
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return ".png"
+    return ".jpg" if data.startswith(b"\xff\xd8\xff") else None
+
+
+@dataclasses.dataclass(frozen=True)
 class Material:
     """What a file calls the look of some faces.
 
     Attributes:
         name: Its name there.
-        colour: Linear RGB in [0, 1]; None if the file doesn't say.
+        colour: Linear RGB in [0, 1], by which a texture is multiplied; None if the file
+            doesn't say.
+        texture: Its base colour as an image; None without one.
     """
 
     name: str
     colour: tuple[float, float, float] | None = None
+    texture: Texture | None = None
 
 
-def make_material(name: str, colour: object = None) -> Material:
+def make_material(name: str, colour: object = None, texture: Texture | None = None) -> Material:
     """A material as a file tells it; a colour that isn't three finite numbers is none.
 
     Args:
         name: Its name.
         colour: Linear RGB, brought into [0, 1].
+        texture: Its image.
     """
     rgb = np.zeros(0) if colour is None else np.asarray(colour)
     if rgb.shape != (3,) or rgb.dtype.kind not in "fiu" or not np.isfinite(rgb).all():
-        return Material(name)
+        return Material(name, texture=texture)
     r, g, b = np.clip(rgb.astype(float), 0.0, 1.0).tolist()
-    return Material(name, (r, g, b))
+    return Material(name, (r, g, b), texture)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -113,6 +152,9 @@ class Polygons:
     @functools.cached_property
     def _digest(self) -> bytes:
         whole = hashlib.sha256(repr(self.materials).encode())
+        for m in self.materials:
+            image = None if m.texture is None else m.texture.data
+            whole.update(b"-" if image is None else hashlib.sha256(image).digest())
         for x in (self.counts, self.corners, self.uv_corners, self.material):
             whole.update(b"-" if x is None else np.ascontiguousarray(x, np.int64).tobytes() + b"+")
         return whole.digest()

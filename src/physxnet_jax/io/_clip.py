@@ -1,11 +1,12 @@
 """What readers read and writers write: meshes at rest and in motion."""
 
 import dataclasses
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..geometry import Polygons
+from ..geometry import Material, Polygons, Texture
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,18 +32,37 @@ class AnimatedMesh:
     polygons: Polygons | None = None
 
     @property
-    def looks(self) -> list[tuple[str, tuple[float, float, float], Int[np.ndarray, " faces"]]]:
-        """Name, colour and triangles of each material; the mesh's own for what has none."""
+    def looks(self) -> list["Look"]:
+        """Of each material its look; the mesh's own for what has none."""
         p = self.polygons
         if p is None or not p.materials:
-            return [(self.name, self.colour, np.arange(len(self.faces)))]
+            return [Look(self.name, self.colour, np.arange(len(self.faces)))]
         of_face = p.material[p.of_triangle]
-        found = [
-            (m.name, self.colour if m.colour is None else m.colour, np.flatnonzero(of_face == k))
-            for k, m in enumerate(p.materials)
-        ]
-        found.append((self.name, self.colour, np.flatnonzero(of_face < 0)))
-        return [look for look in found if len(look[2])]
+        found = [self._look(m, np.flatnonzero(of_face == k)) for k, m in enumerate(p.materials)]
+        found.append(Look(self.name, self.colour, np.flatnonzero(of_face < 0)))
+        return [look for look in found if len(look.faces)]
+
+    def _look(self, m: Material, faces: Int[np.ndarray, " faces"]) -> "Look":
+        image = m.texture
+        if image is None or image.data is None or self.uv is None or self.uv_faces is None:
+            return Look(m.name, self.colour if m.colour is None else m.colour, faces)
+        return Look(m.name, (1.0, 1.0, 1.0) if m.colour is None else m.colour, faces, image)
+
+
+class Look(NamedTuple):
+    """How some faces of a mesh look.
+
+    Attributes:
+        name: Of the material.
+        colour: Linear RGB in [0, 1], by which a texture is multiplied.
+        faces: The triangles, shape [faces].
+        texture: An image that can be put on them; None without one.
+    """
+
+    name: str
+    colour: tuple[float, float, float]
+    faces: Int[np.ndarray, " faces"]
+    texture: Texture | None = None
 
 
 @dataclasses.dataclass(frozen=True)

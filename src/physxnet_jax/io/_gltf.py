@@ -8,6 +8,7 @@ from jaxtyping import Int
 
 from ..errors import FormatError, MissingDependencyError
 from ..files import whole_file
+from ..geometry import Texture
 from ._clip import AnimatedMesh, smooth_normals
 
 MAX_FRAMES = 300
@@ -19,7 +20,7 @@ def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
 
     Frame 0 is the mesh, every other frame a morph target with positions and normals; one
     animation goes through them, linear between frames. Each material has a primitive of its
-    own, all over the same vertices. Where texture coordinates
+    own, all over the same vertices, its image within the file. Where texture coordinates
     part at a seam the vertex is doubled, as glTF asks: the first vertices stay in order
     only for meshes without ``uv``.
 
@@ -78,6 +79,7 @@ class _Builder:
             scenes=[library.Scene(nodes=[])],
         )
         self.blob = bytearray()
+        self.images: dict[Texture, int] = {}
 
     def add(self, m: AnimatedMesh) -> None:
         lib, gltf = self.lib, self.gltf
@@ -96,13 +98,15 @@ class _Builder:
             for k in range(1, len(x))
         ]
         primitives = []
-        for name, colour, chosen in m.looks:
+        for look in m.looks:
+            image = None if look.texture is None else self.image(look.texture)
             gltf.materials.append(
                 lib.Material(
-                    name=name,
+                    name=look.name,
                     doubleSided=True,
                     pbrMetallicRoughness=lib.PbrMetallicRoughness(
-                        baseColorFactor=[*map(float, colour), 1.0],
+                        baseColorFactor=[*map(float, look.colour), 1.0],
+                        baseColorTexture=None if image is None else lib.TextureInfo(index=image),
                         metallicFactor=0.0,
                         roughnessFactor=0.8,
                     ),
@@ -112,7 +116,7 @@ class _Builder:
                 lib.Primitive(
                     attributes=lib.Attributes(**attributes),
                     indices=self.store(
-                        faces[chosen].reshape(-1).astype(np.uint32), "SCALAR", index=True
+                        faces[look.faces].reshape(-1).astype(np.uint32), "SCALAR", index=True
                     ),
                     material=len(gltf.materials) - 1,
                     targets=targets,
@@ -123,6 +127,25 @@ class _Builder:
         )
         gltf.nodes.append(lib.Node(name=m.name, mesh=len(gltf.meshes) - 1))
         gltf.scenes[0].nodes.append(len(gltf.nodes) - 1)
+
+    def image(self, texture: Texture) -> int:
+        """A texture for an image in the buffer; its number."""
+        lib, gltf = self.lib, self.gltf
+        if texture not in self.images:
+            blob = texture.data or b""
+            gltf.bufferViews.append(
+                lib.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=len(blob))
+            )
+            # Whatever follows begins at a multiple of four.
+            self.blob += blob + bytes(-len(blob) % 4)
+            kind = "image/png" if texture.ending == ".png" else "image/jpeg"
+            view = len(gltf.bufferViews) - 1
+            gltf.images.append(lib.Image(name=texture.name, mimeType=kind, bufferView=view))
+            if not gltf.samplers:
+                gltf.samplers.append(lib.Sampler(wrapS=lib.REPEAT, wrapT=lib.REPEAT))
+            gltf.textures.append(lib.Texture(source=len(gltf.images) - 1, sampler=0))
+            self.images[texture] = len(gltf.textures) - 1
+        return self.images[texture]
 
     def animate(self, frames: int, fps: float) -> None:
         if frames < 2:

@@ -4,12 +4,13 @@ import contextlib
 import dataclasses
 import pathlib
 from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import FormatError, PhysXNetError
-from ..geometry import Polygons, make_material
+from ..geometry import Polygons, Texture, make_material, make_texture
 from ..motion import GltfFile, Motion, drive
 from ._moving import Moving, welded
 
@@ -171,7 +172,14 @@ def _polygons(
         plain = told.pbrMetallicRoughness
         rgba = None if plain is None else plain.baseColorFactor
         name = str(told.name or f"material{which}")
-        materials = (make_material(name, [1.0, 1.0, 1.0] if rgba is None else rgba[:3]),)
+        image = None if plain is None else plain.baseColorTexture
+        materials = (
+            make_material(
+                name,
+                [1.0, 1.0, 1.0] if rgba is None else rgba[:3],
+                None if image is None else _texture(file, image),
+            ),
+        )
     corners = faces.reshape(-1)
     return Polygons(
         np.full(count, 3, np.int32),
@@ -180,6 +188,13 @@ def _polygons(
         np.full(count, len(materials) - 1, np.int32),
         materials,
     )
+
+
+def _texture(file: GltfFile, told: Any) -> Texture:
+    """The image of a material; named alone where it asks for other coordinates than are read."""
+    name, data = file.image(told.index)
+    moved = (told.extensions or {}).get("KHR_texture_transform")
+    return make_texture(name, None if told.texCoord or moved else data)
 
 
 def _check_size(file: GltfFile, frames: int, vertices: int) -> None:

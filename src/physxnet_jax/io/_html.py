@@ -157,6 +157,5 @@ def _materials(meshes: Sequence[AnimatedMesh]) -> dict[str, list[tuple[int, list
     """Numbers of each mesh's materials in the glTF, and their colours."""
     number = itertools.count()
     return {
-        m.name: [(next(number), list(map(float, colour))) for _, colour, _ in m.looks]
-        for m in meshes
+        m.name: [(next(number), list(map(float, look.colour))) for look in m.looks] for m in meshes
     }

@@ -194,6 +194,16 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
                 f"made of {len(raw.parts)} meshes ({', '.join(raw.parts)[:200]}): `{path}#NAME`"
                 " takes one of them."
             )
+    looks = () if raw.polygons is None else raw.polygons.materials
+    images = [m.texture for m in looks if m.texture is not None]
+    lost = sorted({t.name for t in images if t.data is None})
+    if lost:
+        notes.append(
+            f"images that won't be put on it: {', '.join(lost)[:200]}. PNG or JPEG in the file's"
+            " folder are, by the first set of texture coordinates."
+        )
+    elif images and raw.uv is None:
+        notes.append("its images won't be put on it: faces without texture coordinates.")
     if posed:
         notes.append("made for a T-pose: worn as it is, its sleeves are turned down with the arms.")
     if health.components > 1:

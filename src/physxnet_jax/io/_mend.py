@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Int
 
 from ..body import Body, load_body
 from ..errors import MeshError
@@ -99,17 +100,18 @@ def fit_garment(
     count = int(np.sum(np.any(np.asarray(turned.faces) != np.asarray(mesh.faces), axis=1)))
     if count:
         done.append(f"turned {count:,} faces round.")
-    mesh, cut = turned, np.asarray(turned.faces)
+    mesh, cut, decimated = turned, np.asarray(turned.faces), False
     drawn = None if raw.polygons is None else polygons_left(raw.polygons, v, mesh)
     count = int(mesh.faces.shape[0])
     if coarser is not None:
         textured = mesh.uv is not None
         mesh = decimate(mesh, coarser)
-        if int(mesh.faces.shape[0]) < count:
+        decimated = int(mesh.faces.shape[0]) < count
+        if decimated:
             lost = ", without its texture coordinates" if textured else ""
             done.append(f"decimated {count:,} faces to {mesh.faces.shape[0]:,}{lost}.")
     count = int(mesh.faces.shape[0])
-    mesh, low = _split_and_lifted(mesh, skin, edge_length)
+    mesh, low, part_of = _split_and_lifted(mesh, skin, edge_length)
     moved = np.asarray(mesh.vertices)
     if int(mesh.faces.shape[0]) > count:
         done.append(f"split {count:,} faces into {mesh.faces.shape[0]:,}.")
@@ -123,9 +125,13 @@ def fit_garment(
         far = np.linalg.norm(lain - moved, axis=1)
         done.append(f"let it down: it moved by {1e3 * float(np.median(far)):.0f} mm.")
         moved, _ = lift_out(skin, lain, np.asarray(mesh.faces), _LIFT * NEAREST, iterations=12)
-    # Whatever cut or joined triangles since knows nothing of polygons.
-    if drawn is not None and not np.array_equal(mesh.faces, cut):
+    # Joining triangles knows nothing of materials, splitting them nothing of polygons.
+    if drawn is not None and decimated:
+        if drawn.materials:
+            done.append("materials are lost: faces that were joined may have had several.")
         drawn = None
+    elif drawn is not None and len(mesh.faces) != len(cut):
+        drawn = _triangles(drawn, part_of, mesh)
         if raw.count < len(raw.faces):
             done.append("polygons are triangles now.")
     _write(out, mesh.replace(vertices=moved), drawn)
@@ -134,25 +140,36 @@ def fit_garment(
 
 def _split_and_lifted(
     mesh: TriMesh, skin: TriMesh, edge_length: float | None
-) -> tuple[TriMesh, int]:
-    """The mesh out of the body, its edges split; and how many vertices lay in it.
+) -> tuple[TriMesh, int, Int[np.ndarray, " faces"]]:
+    """The mesh out of the body, its edges split; how many vertices lay in it; faces' origins.
 
     Lifting stretches edges, which are split again, and the halves lie lower than their ends.
     """
-    count = 0
+    count, part_of = 0, np.arange(len(mesh.faces))
     for again in range(_ROUNDS):
         if edge_length is not None:
-            finer = subdivide(mesh, edge_length)
+            finer, cut = subdivide(mesh, edge_length)
             if again and finer.faces.shape == mesh.faces.shape:
                 break
-            mesh = finer
+            mesh, part_of = finer, part_of[cut]
         x, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
         moved, low = lift_out(skin, x, faces, _LIFT * NEAREST, iterations=12)
         count = max(count, int(low.sum()))
         mesh = mesh.replace(vertices=jnp.asarray(moved, jnp.float32))
         if edge_length is None or not low.any():
             break
-    return mesh, count
+    return mesh, count, part_of
+
+
+def _triangles(drawn: Polygons, part_of: Int[np.ndarray, " faces"], mesh: TriMesh) -> Polygons:
+    """The faces of a mesh that was split, each of the material of what it is a part of."""
+    return Polygons(
+        np.full(len(mesh.faces), 3, np.int32),
+        np.asarray(mesh.faces).reshape(-1),
+        None if mesh.uv_faces is None else np.asarray(mesh.uv_faces).reshape(-1),
+        drawn.material[drawn.of_triangle[part_of]],
+        drawn.materials,
+    )
 
 
 def _write(out: pathlib.Path, mesh: TriMesh, drawn: Polygons | None) -> None:

@@ -9,12 +9,17 @@ from jaxtyping import Float, Int
 
 from ..errors import FormatError
 from ..files import whole_file
-from ..geometry import Material, Polygons, make_material
+from ..geometry import Material, Polygons, Texture, make_material
 from ._clip import StillMesh
+from ._texture import texture_beside, write_textures
 
 _MAX_BYTES = 500_000_000
 _MAX_LIBRARY = 5_000_000
 _NONE = "default"
+# Options of an image in a material file and how many words follow them, for some at most.
+_OPTIONS = {"blendu": 1, "blendv": 1, "bm": 1, "boost": 1, "cc": 1, "clamp": 1, "imfchan": 1}
+_OPTIONS |= {"mm": 2, "texres": 1, "type": 1}
+_NUMBERS = {"o": 3, "s": 3, "t": 3}
 
 
 def read_obj(path: str | pathlib.Path, part: str | None = None) -> StillMesh:
@@ -27,7 +32,7 @@ def read_obj(path: str | pathlib.Path, part: str | None = None) -> StillMesh:
 
     Returns:
         The mesh; vertex order is kept. Polygons keep the names of their materials, and the
-        colours that a material file beside it tells.
+        colours and images that a material file beside it tells.
 
     Raises:
         FormatError: Missing, empty, binary or malformed files; indices out of range;
@@ -131,22 +136,48 @@ def _drawn(
 
 
 def _colours(path: pathlib.Path, libraries: list[str]) -> dict[str, Material]:
-    """Diffuse colours of the material files beside a mesh; what can't be read tells none."""
+    """Materials of the material files beside a mesh; what can't be read tells nothing."""
     found: dict[str, Material] = {}
     for library in libraries:
         # Only what lies beside it: a name may lead anywhere.
         file = path.parent / pathlib.PurePath(library.replace("\\", "/")).name
         if not file.is_file() or file.stat().st_size > _MAX_LIBRARY:
             continue
-        name = None
+        name, colour, image = None, None, None
         for line in file.read_bytes().decode("utf-8", "replace").splitlines():
             words = line.split("#")[0].split()
             if words[:1] == ["newmtl"]:
-                name = _rest(line)
-            elif words[:1] == ["Kd"] and name is not None:
+                name, colour, image = _rest(line), None, None
+            elif words[:1] == ["Kd"]:
                 with contextlib.suppress(ValueError):
-                    found[name] = make_material(name, [float(w) for w in words[1:4]])
+                    colour = [float(w) for w in words[1:4]]
+            elif words[:1] == ["map_Kd"] and words[1:]:
+                image = _image(file, line)
+            if name is not None:
+                # Beside an image most programs write a grey that none of them multiplies by.
+                plain = image is None or image.data is None
+                found[name] = make_material(name, colour if plain else None, image)
     return found
+
+
+def _image(file: pathlib.Path, line: str) -> Texture:
+    """What `map_Kd` names, behind its options; names may have spaces."""
+    rest = _rest(line)
+    while rest.startswith("-"):
+        option, *words = rest.split()
+        key = option[1:].lower()
+        skipped = _OPTIONS.get(key, 0)
+        for word in words[: _NUMBERS.get(key, 0)]:
+            try:
+                float(word)
+            except ValueError:
+                break
+            skipped += 1
+        left = rest.split(None, 1 + skipped)
+        if len(left) <= 1 + skipped:
+            break
+        rest = left[-1]
+    return texture_beside(file, rest)
 
 
 def _rest(line: str) -> str:
@@ -203,15 +234,26 @@ def write_obj(
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_materials(path: str | pathlib.Path, materials: Sequence[Material]) -> None:
-    """Writes an MTL of the materials' names and colours, atomically."""
+def write_materials(path: str | pathlib.Path, materials: Sequence[Material]) -> list[pathlib.Path]:
+    """Writes an MTL of the materials' names and colours, and their images beside it.
+
+    Returns:
+        The files written, each whole or not at all.
+    """
+    path = pathlib.Path(path)
+    images = write_textures(path, [m.texture for m in materials])
     lines = []
     for m in materials:
         lines.append(f"newmtl {m.name}")
-        if m.colour is not None:
-            lines.append("Kd " + " ".join(f"{c:.6g}" for c in m.colour))
+        image = None if m.texture is None else images.get(m.texture)
+        colour = (1.0, 1.0, 1.0) if m.colour is None and image is not None else m.colour
+        if colour is not None:
+            lines.append("Kd " + " ".join(f"{c:.6g}" for c in colour))
+        if image is not None:
+            lines.append(f"map_Kd {image.name}")
     with whole_file(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return [path, *images.values()]
 
 
 def _floats(path: pathlib.Path, n: int, words: list[str], count: int) -> list[float]:

@@ -10,29 +10,39 @@ import numpy as np
 
 from ..errors import MissingDependencyError
 from ..files import whole_file
-from ._clip import AnimatedMesh, smooth_normals, vertex_velocities
+from ..geometry import Texture
+from ._clip import AnimatedMesh, Look, smooth_normals, vertex_velocities
+from ._texture import write_textures
 
 
-def write_usd(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
+def write_usd(
+    path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float
+) -> list[pathlib.Path]:
     """Writes meshes as one animated stage.
 
     Each mesh is a prim under ``/Person`` with points, normals, velocities and extent
     as time samples (frame 0 first), ``st`` texture coordinates and no subdivision. Polygons
-    and materials are those of the mesh, a subset of faces for each of several; a mesh
-    without any has a preview material of its colour. The stage's up axis is Y, its unit the
-    metre, its rate ``fps``.
+    and materials are those of the mesh, a subset of faces for each of several, their images
+    beside the stage; a mesh without any has a preview material of its colour. The stage's up
+    axis is Y, its unit the metre, its rate ``fps``.
 
     Args:
         path: ``.usdc``, ``.usd`` or ``.usda``; written whole or not at all.
         meshes: What to write; all of the same number of frames.
         fps: Frames a second.
 
+    Returns:
+        The files written.
+
     Raises:
         MissingDependencyError: Without usd-core.
     """
     check_usd()
+    path = pathlib.Path(path)
+    images = write_textures(path, [look.texture for m in meshes for look in m.looks])
     with whole_file(path) as part:
-        _write(part, meshes, fps)
+        _write(part, meshes, fps, {t: image.name for t, image in images.items()})
+    return [path, *images.values()]
 
 
 def check_usd() -> None:
@@ -45,7 +55,9 @@ def check_usd() -> None:
         ) from error
 
 
-def _write(part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
+def _write(
+    part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float, images: dict[Texture, str]
+) -> None:
     from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
 
     stage = Usd.Stage.CreateNew(str(part))
@@ -65,7 +77,7 @@ def _write(part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> No
         return Vt.IntArray.FromNumpy(np.ascontiguousarray(x.reshape(-1), dtype=np.int32))
 
     taken: set[str] = set()
-    looks = _Looks(stage)
+    looks = _Looks(stage, images)
     for m in meshes:
         name = _prim_name(m.name, taken)
         prim = UsdGeom.Mesh.Define(stage, f"/Person/{name}")
@@ -95,40 +107,69 @@ def _write(part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> No
         prim.CreateDisplayColorAttr(vectors(np.asarray([m.colour])))
         binding = UsdShade.MaterialBindingAPI.Apply(prim.GetPrim())
         parts: set[str] = set()
-        for called, colour, chosen in m.looks:
-            if len(chosen) == len(m.faces):
-                binding.Bind(looks.material(called, colour))
+        for look in m.looks:
+            if len(look.faces) == len(m.faces):
+                binding.Bind(looks.material(look))
                 continue
-            own = drawn.of_triangle[chosen] if drawn is not None else chosen
+            own = drawn.of_triangle[look.faces] if drawn is not None else look.faces
             subset = binding.CreateMaterialBindSubset(
-                _prim_name(called, parts), numbers(np.unique(own))
+                _prim_name(look.name, parts), numbers(np.unique(own))
             )
-            UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(looks.material(called, colour))
+            UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(looks.material(look))
     stage.GetRootLayer().Save()
 
 
 class _Looks:
-    """Preview materials of a stage, one for each name and colour."""
+    """Preview materials of a stage, one for each name, colour and image."""
 
-    def __init__(self, stage: Any) -> None:
+    def __init__(self, stage: Any, images: dict[Texture, str]) -> None:
         self.stage = stage
-        self.made: dict[tuple[str, tuple[float, float, float]], Any] = {}
+        self.images = images
+        self.made: dict[tuple[object, ...], Any] = {}
         self.taken: set[str] = set()
 
-    def material(self, name: str, colour: tuple[float, float, float]) -> Any:
+    def material(self, look: Look) -> Any:
         from pxr import Gf, Sdf, UsdShade
 
-        if (name, colour) not in self.made:
-            path = f"/Person/Looks/{_prim_name(name, self.taken)}"
+        key = look.name, look.colour, look.texture
+        if key not in self.made:
+            path = f"/Person/Looks/{_prim_name(look.name, self.taken)}"
             material = UsdShade.Material.Define(self.stage, path)
             shader = UsdShade.Shader.Define(self.stage, f"{path}/surface")
             shader.CreateIdAttr("UsdPreviewSurface")
             told = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
-            told.Set(Gf.Vec3f(*(float(c) for c in colour)))
+            if look.texture is None:
+                told.Set(Gf.Vec3f(*(float(c) for c in look.colour)))
+            else:
+                told.ConnectToSource(self._image(path, look).ConnectableAPI(), "rgb")
             shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.8)
             material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
-            self.made[name, colour] = material
-        return self.made[name, colour]
+            self.made[key] = material
+        return self.made[key]
+
+    def _image(self, path: str, look: Look) -> Any:
+        """A shader that reads the image at the mesh's texture coordinates."""
+        from pxr import Gf, Sdf, UsdShade
+
+        at = UsdShade.Shader.Define(self.stage, f"{path}/coordinates")
+        at.CreateIdAttr("UsdPrimvarReader_float2")
+        at.CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+        image = UsdShade.Shader.Define(self.stage, f"{path}/image")
+        image.CreateIdAttr("UsdUVTexture")
+        assert look.texture is not None
+        file = f"./{self.images[look.texture]}"
+        image.CreateInput("file", Sdf.ValueTypeNames.Asset).Set(Sdf.AssetPath(file))
+        image.CreateInput("sourceColorSpace", Sdf.ValueTypeNames.Token).Set("sRGB")
+        for side in ("wrapS", "wrapT"):
+            image.CreateInput(side, Sdf.ValueTypeNames.Token).Set("repeat")
+        tint = Gf.Vec4f(*(float(c) for c in look.colour), 1.0)
+        image.CreateInput("scale", Sdf.ValueTypeNames.Float4).Set(tint)
+        at.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+        image.CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(
+            at.ConnectableAPI(), "result"
+        )
+        image.CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+        return image
 
 
 def _prim_name(name: str, taken: set[str]) -> str:

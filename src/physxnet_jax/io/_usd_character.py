@@ -12,6 +12,7 @@ from jaxtyping import Float
 from ..errors import FormatError, MissingDependencyError
 from ..geometry import Material, Polygons, make_material
 from ._moving import Moving
+from ._texture import texture_beside
 
 # Coordinates and frames that are read at most.
 _MOST, _FRAMES = 3e8, 20_000
@@ -144,14 +145,16 @@ def _meshes(
                     raise FormatError(f"{path}: {prim.GetPath()} is bound by no matrix.")
             x[k] = unit * (local @ world[:3, :3] + world[3, :3])
         uv, rows = _chart(prim, np.asarray(corners))
-        drawn = _polygons(prim, np.asarray(counts), np.asarray(corners), rows) if bound else None
+        drawn = (
+            _polygons(path, prim, np.asarray(counts), np.asarray(corners), rows) if bound else None
+        )
         uv_faces = None if rows is None else rows[slots]
         parts.append(Moving(prim.GetName(), x, faces, uv, uv_faces, polygons=drawn))
     return parts
 
 
 def _polygons(
-    prim: Any, counts: np.ndarray, corners: np.ndarray, rows: np.ndarray | None
+    path: pathlib.Path, prim: Any, counts: np.ndarray, corners: np.ndarray, rows: np.ndarray | None
 ) -> Polygons:
     """Faces of a prim, outwards, with the materials that it or its subsets are bound to."""
     from pxr import UsdGeom, UsdShade
@@ -164,7 +167,11 @@ def _polygons(
             return -1
         surface = bound.ComputeSurfaceSource()[0]
         told = surface.GetInput("diffuseColor") if surface else None
-        material = make_material(bound.GetPrim().GetName(), told.Get() if told else None)
+        image = _image(told) if told else None
+        colour = told.Get() if told else None
+        if image is not None:
+            colour, image = image[0], texture_beside(path, image[1])
+        material = make_material(bound.GetPrim().GetName(), colour, image)
         return found.setdefault(material, len(found))
 
     which = np.full(len(counts), number(prim), np.int32)
@@ -178,12 +185,33 @@ def _polygons(
     return drawn.reversed(np.arange(len(drawn.counts))) if turned else drawn
 
 
-def _chart(prim: Any, vertices: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Texture coordinates `st` and the row of each corner; none if they don't fit."""
-    from pxr import UsdGeom
+def _image(told: Any) -> tuple[object, str] | None:
+    """Tint and file of the image that an input is connected to; None for anything else."""
+    from pxr import UsdShade
 
-    st = UsdGeom.PrimvarsAPI(prim).GetPrimvar("st")
-    # Without its name another set would be a guess.
+    source, *_ = UsdShade.ConnectableAPI.GetConnectedSource(told) or (None,)
+    shader = UsdShade.Shader(source.GetPrim()) if source else None
+    file = shader.GetInput("file") if shader else None
+    asset = file.Get() if file else None
+    # An image for each tile (UDIM) is none of one name.
+    if not shader or not asset or "<UDIM>" in asset.path:
+        return None
+    tint = shader.GetInput("scale")
+    scale = tint.Get() if tint else None
+    return (1.0, 1.0, 1.0) if scale is None else [*scale][:3], asset.path
+
+
+def _chart(prim: Any, vertices: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Texture coordinates `st`, or the only ones, and each corner's row; none if they don't fit."""
+    from pxr import Sdf, UsdGeom
+
+    primvars = UsdGeom.PrimvarsAPI(prim)
+    st = primvars.GetPrimvar("st")
+    if not st or not st.HasValue():
+        kinds = (Sdf.ValueTypeNames.TexCoord2fArray, Sdf.ValueTypeNames.TexCoord2dArray)
+        sets = [p for p in primvars.GetPrimvarsWithValues() if p.GetTypeName() in kinds]
+        # Of several without that name any would be a guess.
+        st = sets[0] if len(sets) == 1 else st
     uv = np.asarray(st.Get() or (), float) if st and st.HasValue() else np.zeros(0)
     if uv.ndim != 2 or uv.shape[1] != 2:
         return None, None

@@ -52,13 +52,14 @@ def write_clip(
 ) -> list[pathlib.Path]:
     """Writes a clip.
 
-    ``.usdc``, ``.usd``, ``.usda``: one stage. ``.glb``: glTF with a morph target a frame.
-    ``.html``: a page that plays it.
+    ``.usdc``, ``.usd``, ``.usda``: one stage, images of materials beside it as
+    ``STEM_IMAGE.png``. ``.glb``: glTF with a morph target a frame. ``.html``: a page that
+    plays it.
     ``.npz``: ``NAME_positions``, ``NAME_faces`` and ``fps``. ``.pc2``, ``.mdd``: for each
     mesh a cache and an OBJ of its first frame with the same vertex order, ``STEM_NAME.pc2``
     and ``STEM_NAME.obj``. ``.obj``: a file for each mesh and frame, ``STEM_NAME_0000.obj``;
     what follows their numbers, of a longer clip before, is removed. Where a mesh has
-    materials, ``STEM_NAME.mtl`` is beside them.
+    materials, ``STEM_NAME.mtl`` is beside them, and their images.
 
     Args:
         path: Where to; its ending says in which format.
@@ -75,8 +76,7 @@ def write_clip(
     path = check_output(path)
     suffix = path.suffix.lower()
     if suffix.startswith(".usd"):
-        write_usd(path, meshes, fps)
-        return [path]
+        return write_usd(path, meshes, fps)
     if suffix == ".npz":
         arrays = {"fps": np.asarray(fps)}
         for m in meshes:
@@ -95,8 +95,7 @@ def write_clip(
         drawn, library = m.polygons, None
         if drawn is not None and drawn.materials:
             library = f"{stem}.mtl"
-            write_materials(path.with_name(library), drawn.materials)
-            written.append(path.with_name(library))
+            written += write_materials(path.with_name(library), drawn.materials)
         if suffix == ".obj":
             for k, x in enumerate(m.positions):
                 frame = path.with_name(f"{stem}_{k:04d}.obj")

@@ -284,6 +284,38 @@ class GltfFile:
         keys, values, mode = track
         return track_at(keys, values, mode, times, "weights")
 
+    def image(self, texture: object) -> tuple[str, bytes | None]:
+        """Name and file of a texture's image; no file where it isn't beside this one."""
+        document = self.document
+        source = document.textures[self.index(texture, document.textures, "texture")].source
+        if source is None:
+            return f"texture{texture}", None
+        told = document.images[self.index(source, document.images, "image")]
+        name = str(told.name or told.uri or f"image{source}")[:200]
+        if told.bufferView is not None:
+            views = document.bufferViews
+            view = views[self.index(told.bufferView, views, "view")]
+            start, size = view.byteOffset or 0, view.byteLength or 0
+            blob = self._buffer(view.buffer)
+            if min(start, size) < 0 or start + size > len(blob):
+                raise self.broken(f"view {told.bufferView} reaches past its buffer")
+            return name, blob[start : start + size]
+        if told.uri is None:
+            return name, None
+        if told.uri.startswith("data:"):
+            return name if told.name else f"image{source}", self._decoded(told.uri, "image")
+        try:
+            return name, self._beside(told.uri)
+        # A mesh without its image is a mesh all the same.
+        except MotionError:
+            return name, None
+
+    def _decoded(self, uri: str, what: str) -> bytes:
+        try:
+            return base64.b64decode(uri.partition(",")[2], validate=True)
+        except binascii.Error as error:
+            raise self.broken(f"{what} isn't base64") from error
+
     def _buffer(self, which: object) -> bytes:
         n = self.index(which, self.document.buffers, "buffer")
         if n not in self._buffers:
@@ -291,10 +323,7 @@ class GltfFile:
             if uri is None:
                 self._buffers[n] = self.document.binary_blob() or b""
             elif uri.startswith("data:"):
-                try:
-                    self._buffers[n] = base64.b64decode(uri.partition(",")[2], validate=True)
-                except binascii.Error as error:
-                    raise self.broken(f"buffer {n} isn't base64") from error
+                self._buffers[n] = self._decoded(uri, f"buffer {n}")
             else:
                 self._buffers[n] = self._beside(uri)
         return self._buffers[n]

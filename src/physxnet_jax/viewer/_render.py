@@ -1,6 +1,7 @@
 """Still pictures and videos of dressed people, off screen."""
 
 import importlib.util
+import io
 import os
 import pathlib
 import warnings
@@ -11,7 +12,8 @@ import numpy as np
 
 from ..errors import FormatError, MissingDependencyError
 from ..files import check_writable, whole_file
-from ..io import AnimatedMesh
+from ..geometry import Texture
+from ..io import AnimatedMesh, smooth_normals
 
 PREVIEWS = (".mp4", ".gif", ".png")
 # Height that is shown at least, floor included [m].
@@ -47,6 +49,7 @@ class _Stage:
         if title:
             self.plotter.add_text(title, position="upper_edge", font_size=12, color="#202428")
         self.meshes = meshes
+        self.images: dict[Texture, Any] = {}
         self.floor = float(min(m.positions[..., 1].min() for m in meshes))
         # High jumps and raised arms stay in the picture.
         top = float(max(m.positions[..., 1].max() for m in meshes))
@@ -70,11 +73,14 @@ class _Stage:
         centre = self.meshes[0].positions[frame].mean(axis=0)
         for k, m in enumerate(self.meshes):
             looks = m.looks
-            painted: dict[str, Any] = {"color": looks[0][1]}
+            if any(look.texture is not None for look in looks):
+                self._put_images(k, m, frame)
+                continue
+            painted: dict[str, Any] = {"color": looks[0].colour}
             if len(looks) > 1:
                 paint = np.zeros((len(m.faces), 3), np.uint8)
-                for _, colour, chosen in looks:
-                    paint[chosen] = np.round(255 * np.asarray(colour))
+                for look in looks:
+                    paint[look.faces] = np.round(255 * np.asarray(look.colour))
                 painted = {"scalars": paint, "rgb": True}
             # Named meshes replace the last frame's; smooth shading needs new normals anyway.
             self.plotter.add_mesh(
@@ -83,7 +89,7 @@ class _Stage:
                 smooth_shading=True,
                 specular=0.1,
                 reset_camera=False,
-                backface_params={"color": tuple(0.6 * c for c in looks[0][1])},
+                backface_params={"color": tuple(0.6 * c for c in looks[0].colour)},
                 **painted,
             )
         target = np.array([centre[0], self.floor + 0.5 * self.span, centre[2]])
@@ -93,6 +99,51 @@ class _Stage:
         # A screenshot alone would show the meshes from where the camera stood before.
         self.plotter.render()
         return np.asarray(self.plotter.screenshot(return_img=True))
+
+    def _put_images(self, k: int, m: AnimatedMesh, frame: int) -> None:
+        """A mesh of which some faces have images, each look as a mesh of its own."""
+        import pyvista
+
+        normals = smooth_normals(m.positions[frame : frame + 1], m.faces)[0]
+        for n, look in enumerate(m.looks):
+            corners = m.faces[look.faces].reshape(-1)
+            part = pyvista.PolyData.from_regular_faces(
+                m.positions[frame][corners], np.arange(len(corners)).reshape(-1, 3)
+            )
+            part.point_data.active_normals = normals[corners]
+            image = None
+            if look.texture is not None and m.uv is not None and m.uv_faces is not None:
+                part.active_texture_coordinates = m.uv[m.uv_faces[look.faces].reshape(-1)]
+                image = self._image(look.texture)
+            self.plotter.add_mesh(
+                part,
+                name=f"mesh{k}_{n}",
+                color=look.colour,
+                texture=image,
+                smooth_shading=True,
+                specular=0.1,
+                reset_camera=False,
+            )
+
+    def _image(self, texture: Texture) -> Any:
+        import imageio.v2 as imageio
+        import pyvista
+
+        if texture not in self.images:
+            try:
+                pixels = np.asarray(imageio.imread(io.BytesIO(texture.data or b"")))
+            # A damaged image is none.
+            except Exception:
+                pixels = np.full((1, 1, 3), 200, np.uint8)
+            if pixels.dtype == np.uint16:
+                pixels = pixels >> 8
+            if pixels.ndim == 2:
+                pixels = np.repeat(pixels[..., None], 3, axis=2)
+            pixels = pixels[..., :3] if pixels.shape[2] > 2 else pixels[..., :1].repeat(3, axis=2)
+            made = pyvista.Texture(np.ascontiguousarray(pixels, np.uint8))
+            made.repeat, made.interpolate = True, True
+            self.images[texture] = made
+        return self.images[texture]
 
 
 def render_frame(

@@ -89,7 +89,7 @@ class Stage:
 
     def _mesh(self, mesh: AnimatedMesh, folder: str) -> Any:
         # Display colours are linear, a browser's aren't.
-        most = max(mesh.looks, key=lambda look: len(look[2]))[1]
+        most = max(mesh.looks, key=lambda look: len(look.faces)).colour
         colour = tuple(int(255 * c ** (1 / 2.2)) for c in most)
         if mesh.name in self.shown.distances and not folder:
             colour = (205, 205, 205)
