@@ -56,7 +56,11 @@ if _TYPE_CHECKING:
         make_wearable as make_wearable,
         pad_clip as pad_clip,
     )
-    from .motion import Motion as Motion, load_motion as load_motion
+    from .motion import (
+        Motion as Motion,
+        inspect_motion as inspect_motion,
+        load_motion as load_motion,
+    )
     from .simulation import Scene as Scene, simulate as simulate
     from .uv import bind as bind, make_atlas as make_atlas
 
@@ -80,7 +84,7 @@ _ROOMS = {
     "garment": ("Fabric", "Garment", "template"),
     "io": ("fit_garment", "inspect_garment", "load_garment", "load_predictor", "write_clip"),
     "models": ("Predictor", "dress_frames", "make_wearable", "pad_clip"),
-    "motion": ("Motion", "load_motion"),
+    "motion": ("Motion", "inspect_motion", "load_motion"),
     "simulation": ("Scene", "simulate"),
     "uv": ("bind", "make_atlas"),
 }
@@ -106,6 +110,7 @@ __all__ = [
     "dress_frames",
     "fit_garment",
     "inspect_garment",
+    "inspect_motion",
     "load_body",
     "load_character",
     "load_garment",

@@ -77,16 +77,25 @@ class Dress:
 
 @dataclasses.dataclass(frozen=True)
 class Inspect:
-    """Look at garment files: unit, axes, mesh, fit, binding; say what mends them.
+    """Look at garment or motion files: what they are, what is wrong, what mends it.
 
     Examples:
       physxnet inspect my_shirt.obj
       physxnet inspect coat.glb coat.glb#sleeves --json
+      physxnet inspect dance.bvh walk.amc
     """
 
     files: tyro.conf.Positional[tuple[pathlib.Path, ...]]
-    """Garments: .obj, .glb, .gltf, .usd, .usda, .usdc, .ply, .stl; coat.glb#sleeves is one mesh of
-    several."""
+    """Garments (.obj, .glb, .gltf, .usd, .usda, .usdc, .ply, .stl; coat.glb#sleeves is one mesh of
+    several) or motions (.bvh, .amc, .npz, .vrma, .glb and .gltf without a mesh, built-in clips)."""
+    motion: bool = False
+    """Of a .glb or .gltf that has both look at the animation."""
+    source_fps: float | None = None
+    """True rate of the motion files, where their headers are wrong."""
+    skeleton: pathlib.Path | None = None
+    """The ASF of AMC files."""
+    joint_map: pathlib.Path | None = None
+    """Joint names of the motion files, for unknown ones: TOML lines like Hips = "pelvis"."""
     json: bool = False
     """Print JSON for machines instead of tables."""
     debug: bool = False

@@ -1,7 +1,8 @@
-"""`physxnet inspect` and `physxnet fit`: garment files, looked at and mended."""
+"""`physxnet inspect` and `physxnet fit`: files of garments and motions, looked at and mended."""
 
 import dataclasses
 import math
+import pathlib
 from typing import Any
 
 import numpy as np
@@ -13,22 +14,47 @@ from ..body import load_body
 from ..errors import MeshError
 from ..garment import template
 from ..io import Inspection, fit_garment, inspect_garment, write_obj
+from ..motion import CLIPS, GltfFile, MotionInspection, inspect_motion
 from ._commands import Fit, Inspect, Rest
 from ._progress import print_json, progress_bars
+
+# What holds motion alone.
+_MOTIONS = (".bvh", ".amc", ".npz", ".vrma")
 
 
 def inspect(command: Inspect, console: Console) -> int:
     """Shows every file; 1 if one of them needs mending."""
     if not command.files:
         raise MeshError("no file to look at: name one, as in `physxnet inspect my_shirt.obj`.")
-    found = []
+    found: list[Inspection | MotionInspection] = []
     for file in command.files:
-        found.append(inspect_garment(file))
+        if command.motion or _is_motion(file):
+            found.append(
+                inspect_motion(
+                    file,
+                    source_fps=command.source_fps,
+                    skeleton=command.skeleton,
+                    joint_map=command.joint_map,
+                )
+            )
+        else:
+            found.append(inspect_garment(file))
         if not command.json:
             _show(found[-1], console)
     if command.json:
         print_json([_plain(f) for f in found])
     return int(any(f.problems for f in found))
+
+
+def _is_motion(file: pathlib.Path) -> bool:
+    """Whether a file holds motion and no mesh."""
+    suffix = file.suffix.lower()
+    if suffix in _MOTIONS or str(file) in CLIPS:
+        return True
+    if suffix not in (".glb", ".gltf") or not file.is_file():
+        return False
+    document = GltfFile(file).document
+    return bool(document.animations) and not document.meshes
 
 
 def fit(command: Fit, console: Console) -> int:
@@ -79,10 +105,35 @@ def rest(command: Rest, shape: Float[Array, " shapes"], console: Console) -> int
     return 0
 
 
-def _show(found: Inspection, console: Console) -> None:
+def _show(found: Inspection | MotionInspection, console: Console) -> None:
+    rows = _of_garment(found) if isinstance(found, Inspection) else _of_motion(found)
+    table = Table(title=str(found.path), title_justify="left", show_header=False)
+    for name, value in rows:
+        table.add_row(name, value)
+    console.print(table)
+    for line in found.problems:
+        console.print(f"wrong: {line}", highlight=False, markup=False)
+    for line in found.notes:
+        console.print(f"note:  {line}", highlight=False, markup=False)
+    console.print(found.verdict, highlight=False, markup=False, soft_wrap=True)
+
+
+def _of_motion(found: MotionInspection) -> list[tuple[str, str]]:
+    joints = f"{found.joints}, {found.carried} of the body's follow them"
+    return [
+        ("frames", f"{found.frames:,} at {found.fps:g} a second: {found.seconds:.2f} s"),
+        ("names of joints", found.skeleton),
+        ("joints", joints if found.joints else "-"),
+        ("turns from", found.reference),
+        ("unit", found.unit or "none of the usual ones; it doesn't matter"),
+        ("way of the hips", f"{found.travelled:.1f} m, at up to {found.fastest:.1f} m/s"),
+        ("lower foot", f"{100 * found.feet:.1f} cm above the floor, in the median"),
+    ]
+
+
+def _of_garment(found: Inspection) -> list[tuple[str, str]]:
     h = found.health
     unit = "of its own" if found.unit is None else found.unit
-    table = Table(title=str(found.path), title_justify="left", show_header=False)
     rows: list[tuple[str, str]] = [
         ("size", " x ".join(f"{s:.4g}" for s in found.size) + f" ({unit})"),
         ("up axis", found.up or "unknown"),
@@ -103,16 +154,9 @@ def _show(found: Inspection, console: Console) -> None:
             ("apart from", ", ".join(f"{t} {1e3 * d:.0f} mm" for t, d in found.apart.items())),
             ("rays that bind it", f"{100 * found.hit_rate:.1f} %"),
         ]
-    for name, value in rows:
-        table.add_row(name, value)
-    console.print(table)
-    for line in found.problems:
-        console.print(f"wrong: {line}", highlight=False, markup=False)
-    for line in found.notes:
-        console.print(f"note:  {line}", highlight=False, markup=False)
-    console.print(found.verdict, highlight=False, markup=False, soft_wrap=True)
+    return rows
 
 
-def _plain(found: Inspection) -> dict[str, Any]:
+def _plain(found: Inspection | MotionInspection) -> dict[str, Any]:
     values = dataclasses.asdict(found) | {"path": str(found.path), "verdict": found.verdict}
     return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}

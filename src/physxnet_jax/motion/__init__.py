@@ -8,6 +8,7 @@ from ._faults import sudden_turns as sudden_turns
 from ._follow import follow_surface as follow_surface
 from ._gltf import read_gltf as read_gltf
 from ._gltf_file import GLTF_FORMATS as GLTF_FORMATS, GltfFile as GltfFile
+from ._inspect import MotionInspection as MotionInspection, inspect_motion as inspect_motion
 from ._load import load_motion as load_motion, save_motion as save_motion
 from ._motion import (
     Motion as Motion,

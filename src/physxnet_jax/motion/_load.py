@@ -58,29 +58,67 @@ def load_motion(
         >>> load_motion("walk", fps=30).fps
         30.0
     """
+    read = read_motion(
+        motion, fps=fps, source_fps=source_fps, skeleton=skeleton, body=body, shape=shape
+    )
+    clip = fitted_motion(read, body, joint_map=joint_map, shape=shape)
+    return clip if fps is None or fps == clip.fps else resample(clip, fps)
+
+
+def fitted_motion(
+    read: SourceClip | Motion,
+    body: Body | None = None,
+    *,
+    joint_map: Mapping[str, str] | str | pathlib.Path | None = None,
+    shape: Float[Array, " shapes"] | None = None,
+) -> Motion:
+    """What was read, on the body's skeleton."""
+    if isinstance(read, Motion):
+        return read
+    if isinstance(joint_map, str | pathlib.Path):
+        joint_map = read_joint_map(joint_map)
+    return retarget(read, body, joint_map=joint_map, shape=shape)
+
+
+def read_motion(
+    motion: str | pathlib.Path,
+    *,
+    fps: float | int | None = None,
+    source_fps: float | int | None = None,
+    skeleton: str | pathlib.Path | None = None,
+    body: Body | None = None,
+    shape: Float[Array, " shapes"] | None = None,
+) -> SourceClip | Motion:
+    """A motion as its file has it, or already on the body's skeleton where it comes so.
+
+    Args:
+        motion: As `load_motion` takes it.
+        fps: Rate at which a built-in clip is computed [1/s].
+        source_fps: True rate of the file.
+        skeleton: The ASF of an AMC file.
+        body: Body of built-in clips.
+        shape: Its shape parameters.
+    """
     for name, rate in (("fps", fps), ("source_fps", source_fps)):
         if rate is not None and not (math.isfinite(rate) and rate > 0):
             raise MotionError(f"{name} is {rate}, expected a positive number.")
     path = pathlib.Path(motion)
     suffix = path.suffix.lower()
-    source: SourceClip | None = None
-    clip: Motion | None = None
     if suffix == ".bvh":
-        source = read_bvh(path)
+        read = read_bvh(path)
     elif suffix == ".amc":
-        source = read_amc(path, skeleton)
+        read = read_amc(path, skeleton)
     elif suffix in GLTF_FORMATS:
-        source = read_gltf(path)
+        read = read_gltf(path)
     elif suffix == ".npz":
         read = _read_npz(path)
-        source, clip = (read, None) if isinstance(read, SourceClip) else (None, read)
     elif str(motion) in CLIPS:
         if source_fps is not None:
             raise MotionError(
                 f"source_fps is the true rate of a file; '{motion}' is computed at any rate."
                 " Leave it out."
             )
-        clip = procedural_clip(str(motion), fps=float(fps or 30), body=body, shape=shape)
+        return procedural_clip(str(motion), fps=float(fps or 30), body=body, shape=shape)
     elif suffix == ".fbx":
         raise MotionError.at(path, None, "FBX isn't read", "Export BVH or glTF, from Blender say")
     else:
@@ -88,16 +126,7 @@ def load_motion(
             f"{motion}: neither a .bvh, .amc, .glb, .gltf, .vrma or .npz file nor a built-in clip"
             f" ({', '.join(CLIPS)})."
         )
-    if source is not None:
-        if isinstance(joint_map, str | pathlib.Path):
-            joint_map = read_joint_map(joint_map)
-        if source_fps is not None:
-            source = dataclasses.replace(source, fps=float(source_fps))
-        clip = retarget(source, body, joint_map=joint_map, shape=shape)
-    assert clip is not None
-    if source_fps is not None and source is None:
-        clip = make_motion(clip.rotations, clip.root, source_fps, name=clip.name)
-    return clip if fps is None or fps == clip.fps else resample(clip, fps)
+    return read if source_fps is None else dataclasses.replace(read, fps=float(source_fps))
 
 
 def save_motion(path: str | pathlib.Path, motion: Motion) -> None:

@@ -22,12 +22,12 @@ _T_POSE = float(np.cos(np.radians(25.0)))
 
 def upright(source: SourceClip, index: Mapping[str, int]) -> SourceClip:
     """The clip with Y up, if its skeleton stands along Z at rest."""
-    if _stands(source, index, 2) and not _stands(source, index, 1):
+    if stands(source, index, 2) and not stands(source, index, 1):
         return source.turned(Rotation.from_euler("X", -90, degrees=True).as_matrix())
     return source
 
 
-def _stands(source: SourceClip, index: Mapping[str, int], axis: int) -> bool:
+def stands(source: SourceClip, index: Mapping[str, int], axis: int) -> bool:
     """Whether both legs point down this axis at rest, and the arms lie above them."""
     positions = _pose_positions(source, source.rest_rotations())
     legs = [positions[index[f"{s}Foot"]] - positions[index[f"{s}UpLeg"]] for s in _BOTH]
@@ -54,8 +54,8 @@ def reference_pose(
     first = source.rotations[0]
     limbs = {k: v for k, v in index.items() if k in LIMBS and LIMBS[k] in index}
     rest = source.rest_rotations()
-    stands = _stands(source, index, 1)
-    stance = _heading(_pose_positions(source, rest), index) if stands else np.eye(3)
+    standing = stands(source, index, 1)
+    stance = _heading(_pose_positions(source, rest), index) if standing else np.eye(3)
     upright = np.abs(first[index["Hips"]] - rest[index["Hips"]]).max() < 0.1
     if may_have_t_pose and upright and len(source.root) > 1:
         pointing = limb_directions(source, index, first)
@@ -67,7 +67,7 @@ def reference_pose(
         down = [-pointing[k][1] for k in limbs if "Leg" in k]
         if min(sideways + down) > _T_POSE:
             return first, 1, stance
-    if not stands:
+    if not standing:
         frame = _straightest(source, index)
         return source.rotations[frame], 0, _stance(source, frame, index)
     # CMU's skeletons stand astride at rest: straighten each leg as one.

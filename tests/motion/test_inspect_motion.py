@@ -1,0 +1,152 @@
+"""What `inspect` finds in a motion is there, and nothing is found in a good one."""
+
+import dataclasses
+import json
+import pathlib
+import runpy
+
+import jax.numpy as jnp
+import numpy as np
+import pygltflib
+import pytest
+
+from physxnet_jax import inspect_motion
+from physxnet_jax.cli import main
+from physxnet_jax.errors import MotionError
+from physxnet_jax.motion import JOINT_MAPS, load_motion, procedural_clip, save_motion
+
+_TESTS = pathlib.Path(__file__).parent
+_write_gltf = runpy.run_path(str(_TESTS / "test_gltf_motion.py"))["write_gltf"]
+bvh = runpy.run_path(str(_TESTS / "test_skeletons.py"))["bvh"]
+
+
+@pytest.fixture(scope="module")
+def walk(body):
+    return procedural_clip("walk", fps=30.0, body=body)
+
+
+def test_a_good_motion_is_ready(walk):
+    found = inspect_motion("walk")
+    assert found.problems == found.notes == found.left_out == ()
+    assert found.verdict == "ready: physxnet dress walk --wear top bottom -o walk.usdc"
+    assert (found.frames, found.fps, found.unit) == (walk.num_frames, 30.0, "m")
+    assert found.seconds == pytest.approx(walk.num_frames / 30)
+    steps = np.diff(np.asarray(walk.root, np.float64), axis=0)
+    assert found.travelled == pytest.approx(np.linalg.norm(steps[:, [0, 2]], axis=1).sum())
+    assert found.fastest == pytest.approx(30 * np.linalg.norm(steps, axis=1).max(), rel=1e-5)
+    assert 0 <= found.feet < 0.02 and found.carried == found.joints
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(0.01, "cm"), (1.0, "m"), (0.37, None)])
+def test_the_unit_is_told_by_the_legs(body, rest, walk, tmp_path, scale, unit):
+    path = tmp_path / "walk.bvh"
+    text = bvh(body, rest, walk, JOINT_MAPS["mixamo"])
+    # The helper writes centimetres.
+    lines = []
+    for line in text.splitlines():
+        head, _, numbers = line.partition("OFFSET ")
+        if numbers:
+            line = f"{head}OFFSET " + " ".join(
+                f"{0.01 / scale * float(x):.6f}" for x in numbers.split()
+            )
+        lines.append(line)
+    path.write_text("\n".join(lines))
+    found = inspect_motion(path)
+    assert found.unit == unit and found.skeleton in ("mixamo", "cmu-motionbuilder")
+    assert found.reference in ("its rest pose", "the T-pose in its first frame, which is left out")
+
+
+def test_what_is_wrong_is_found_where_it_is(body, rest, walk, tmp_path):
+    def seen(name, **change):
+        save_motion(tmp_path / f"{name}.npz", dataclasses.replace(walk, **change))
+        return inspect_motion(tmp_path / f"{name}.npz")
+
+    root = np.asarray(walk.root)
+    far = root.copy()
+    far[50:] += [0.0, 0.0, 3.0]
+    thrown = seen("thrown", root=jnp.asarray(far))
+    assert len(thrown.problems) == 1 and "at frame 49" in thrown.problems[0]
+    assert "--source-fps" in thrown.problems[0] and "look at what is wrong" in thrown.verdict
+    deep = root.copy()
+    deep[60, 1] -= 0.5
+    sunk = dataclasses.replace(walk, root=jnp.asarray(deep))
+    (note,) = seen("deep", root=jnp.asarray(deep)).notes
+    assert note.startswith("a foot is 50 cm below the floor at frame 60")
+    # Of a file of other skeletons the lowest frame is put on the floor.
+    (tmp_path / "deep.bvh").write_text(bvh(body, rest, sunk, JOINT_MAPS["mixamo"]))
+    assert any("50 cm above the floor" in n for n in inspect_motion(tmp_path / "deep.bvh").notes)
+    one = seen("one", root=walk.root[:1], rotations=walk.rotations[:1])
+    assert any("a single frame" in n for n in one.notes) and one.fastest == 0
+
+
+def test_a_limb_that_turns_over_is_named(walk, body, tmp_path):
+    turns = np.asarray(walk.rotations).copy()
+    j = body.joint("LeftUpLeg")
+    w, x, y, z = turns[70:, j].T
+    # Half a turn about its own axis.
+    turns[70:, j] = np.stack([-y, -z, w, x], axis=1)
+    save_motion(tmp_path / "a.npz", dataclasses.replace(walk, rotations=jnp.asarray(turns)))
+    (problem,) = inspect_motion(tmp_path / "a.npz").problems
+    assert problem.startswith("LeftUpLeg turns by 1") and "from frame 69 to 70" in problem
+
+
+def test_a_map_of_ones_own_is_in_the_command(body, rest, walk, tmp_path):
+    names = {b: f"own {k}" for k, b in enumerate(JOINT_MAPS["mixamo"])}
+    path, table = tmp_path / "my walk.bvh", tmp_path / "names.toml"
+    path.write_text(bvh(body, rest, walk, {b: n.replace(" ", "") for b, n in names.items()}))
+    with pytest.raises(MotionError, match="unknown joints"):
+        inspect_motion(path)
+    table.write_text("\n".join(f'{b} = "{n.replace(" ", "")}"' for b, n in names.items()))
+    found = inspect_motion(path, joint_map=table, source_fps=60)
+    assert found.skeleton == "own map" and found.fps == 60
+    assert found.carried == len(names) and found.joints == len(names)
+    assert f"--joint-map {table} --source-fps 60" in found.command and "'my walk.usdc'" in (
+        found.command
+    )
+    assert any("60 frames a second become 30" in n for n in found.notes)
+
+
+def test_real_clips(data_dir):
+    mocap = data_dir / "mocap"
+    found = inspect_motion(mocap / "mb" / "005_06.bvh")
+    assert "RightUpLeg turns by" in found.problems[0] and found.skeleton == "cmu-motionbuilder"
+    asf = inspect_motion(mocap / "amc" / "001_01.amc")
+    assert asf.unit == "5.6 cm, CMU's" and asf.skeleton == "cmu-asf" and not asf.problems
+    slow = next((mocap / "daz").glob("060_*.bvh"))
+    said = inspect_motion(slow)
+    assert any("--source-fps 60" in n for n in said.notes) and said.unit == "cm"
+    assert "ToeBase" in " ".join(said.left_out)
+    told = inspect_motion(slow, source_fps=60)
+    assert not any("--source-fps 60" in n for n in told.notes) and told.fps == 60
+    assert told.frames == load_motion(slow, source_fps=60).num_frames
+
+
+def test_the_command_looks_at_motions_beside_garments(body, rest, walk, tmp_path, capsys):
+    short = dataclasses.replace(walk, root=walk.root[:8], rotations=walk.rotations[:8])
+    save_motion(tmp_path / "walk.npz", short)
+    _write_gltf(tmp_path / "walk.glb", body, rest, short)
+    assert main(["inspect", "walk", str(tmp_path / "walk.npz"), "--json"]) == 0
+    a, b = json.loads(capsys.readouterr().out)
+    assert a["frames"] == 120 and b["frames"] == 8 and b["verdict"].startswith("ready")
+    # A glTF without a mesh is a motion, one with a mesh is a garment unless told otherwise.
+    document = pygltflib.GLTF2().load(str(tmp_path / "walk.glb"))
+    assert document is not None and document.animations
+    bare = not document.meshes
+    words = ["inspect", str(tmp_path / "walk.glb"), *([] if bare else ["--motion"])]
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "8 at 30 a second" in said and "ready: physxnet dress" in said
+    document.meshes = [pygltflib.Mesh(name="m")]
+    document.save(str(tmp_path / "both.glb"))
+    assert main(["inspect", str(tmp_path / "both.glb")]) == 2
+    assert "no mesh in it" in capsys.readouterr().err
+    assert main(["inspect", "--motion", str(tmp_path / "both.glb")]) == 0
+    assert "8 at 30 a second" in capsys.readouterr().out
+
+
+def test_a_problem_is_an_exit_code(walk, tmp_path, capsys):
+    far = np.asarray(walk.root).copy()
+    far[50:] += [0.0, 0.0, 3.0]
+    save_motion(tmp_path / "a.npz", dataclasses.replace(walk, root=jnp.asarray(far)))
+    assert main(["inspect", str(tmp_path / "a.npz")]) == 1
+    assert "wrong: its hips go at" in capsys.readouterr().out
