@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import pathlib
 import shlex
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -21,6 +22,7 @@ from ..garment import (
 )
 from ..geometry import TriMesh, make_mesh
 from ..uv import bind, garment_map_rows, make_atlas
+from ._clip import StillMesh
 from ._garment import (
     ELSEWHERE,
     HANGS,
@@ -112,23 +114,11 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     path = pathlib.Path(path)
     body = load_body() if body is None else body
     raw = read_mesh(path)
-    size = tuple(float(s) for s in np.ptp(raw.vertices, axis=0))
     skin = body.rest_mesh()
-    problems, notes, options = [], [], []
     try:
         v, unit, up, posed = place_on_body(path, raw.vertices, body, raw.faces)
     except MeshError as error:
-        problems.append(str(error).partition(": ")[2])
-        # The template whose place it fills best; the user may know better.
-        nearest = min(TEMPLATES, key=lambda t: place_like(raw.vertices, template(t), skin)[2])
-        options.append(f"--like {nearest}")
-        health = mesh_health(make_mesh(raw.vertices, raw.faces, raw.uv, raw.uv_faces))
-        nan = float("nan")
-        command = _command(path, options)
-        return Inspection(
-            path, None, None, size, health, raw.count, nan, nan, nan, nan, nan, None, {}, nan,
-            tuple(problems), (), command,
-        )  # fmt: skip
+        return _nowhere(path, raw, skin, str(error).partition(": ")[2])
     mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
     health = mesh_health(mesh)
     distance, _ = clearance(skin, np.asarray(v, np.float32))
@@ -140,6 +130,70 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     outward = float(np.mean(np.einsum("fi,fi->f", normal, away) > 0))
     garment, _ = load_garment(path, body=body)
     hit_rate = _hit_rate(body, garment)
+    found = _Found([], [], [])
+    _tell_mesh(found, health, outward)
+    _tell_place(found, raw, distance, inside, hit_rate, skin)
+    _tell_size(found, health, hangs)
+    outfit = _tell_parts(found, path, raw, body)
+    _tell_images(found, raw)
+    if posed:
+        found.notes.append(
+            "made for a T-pose: worn as it is, its sleeves are turned down with the arms."
+        )
+    if health.components > 1:
+        found.notes.append(f"{health.components} parts that nothing joins: each moves by itself.")
+    if hit_rate < 1 - _MISSED:
+        found.notes.append(
+            f"{100 * (1 - hit_rate):.0f} % of the vertices' rays miss the body; they are bound to"
+            " the closest skin."
+        )
+    return Inspection(
+        path,
+        unit,
+        up,
+        _size(raw),
+        health,
+        raw.count,
+        float(np.median(np.abs(distance))),
+        float(distance.max()),
+        hangs,
+        inside,
+        outward,
+        garment.template,
+        _apart(v),
+        hit_rate,
+        tuple(found.problems),
+        tuple(found.notes),
+        outfit or (_command(path, found.options) if found.problems else None),
+    )
+
+
+class _Found(NamedTuple):
+    """What is told of a garment, and the options of `fit` that mend it."""
+
+    problems: list[str]
+    notes: list[str]
+    options: list[str]
+
+
+def _size(raw: StillMesh) -> tuple[float, ...]:
+    return tuple(float(s) for s in np.ptp(raw.vertices, axis=0))
+
+
+def _nowhere(path: pathlib.Path, raw: StillMesh, skin: TriMesh, problem: str) -> Inspection:
+    """What can be said of a mesh that no unit and axis puts on the body."""
+    # The template whose place it fills best; the user may know better.
+    nearest = min(TEMPLATES, key=lambda t: place_like(raw.vertices, template(t), skin)[2])
+    health = mesh_health(make_mesh(raw.vertices, raw.faces, raw.uv, raw.uv_faces))
+    nan = float("nan")
+    command = _command(path, [f"--like {nearest}"])
+    return Inspection(
+        path, None, None, _size(raw), health, raw.count, nan, nan, nan, nan, nan, None, {}, nan,
+        (problem,), (), command,
+    )  # fmt: skip
+
+
+def _tell_mesh(found: _Found, health: MeshHealth, outward: float) -> None:
     counts = (
         (health.coincident_vertices, "vertices that coincide with another one: cloth tears there"),
         (health.degenerate_faces, "faces without an area"),
@@ -147,78 +201,84 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         (health.unused_vertices, "vertices that no face uses"),
         (health.inconsistent_edges, "edges whose faces run in different senses"),
     )
-    problems += [f"{n:,} {what}." for n, what in counts if n]
+    found.problems.extend(f"{n:,} {what}." for n, what in counts if n)
     if outward < 0.5:
-        problems.append(f"its faces look inwards ({100 * outward:.0f} % look away from the body).")
+        found.problems.append(
+            f"its faces look inwards ({100 * outward:.0f} % look away from the body)."
+        )
     if health.non_manifold_edges:
-        notes.append(
+        found.notes.append(
             f"{health.non_manifold_edges:,} edges have more than two faces; they are kept, and fold"
             " without resistance."
         )
+
+
+def _tell_place(
+    found: _Found,
+    raw: StillMesh,
+    distance: np.ndarray,
+    inside: float,
+    hit_rate: float,
+    skin: TriMesh,
+) -> None:
     if inside > _INSIDE:
-        problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
+        found.problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
     loose = hit_rate < _UNBOUND and float(np.median(np.abs(distance))) > LONG
     if inside > ELSEWHERE or loose:
         # Worn the wrong way round or in another place: lifting it out would ruin it.
-        found = _elsewhere(raw.vertices, distance, skin)
-        if found is not None:
-            name, told = found
-            problems.append(f"it lies or faces elsewhere than a {name}: {told}")
-            options.append(f"--like {name}")
+        better = _elsewhere(raw.vertices, distance, skin)
+        if better is not None:
+            name, told = better
+            found.problems.append(f"it lies or faces elsewhere than a {name}: {told}")
+            found.options.append(f"--like {name}")
+
+
+def _tell_size(found: _Found, health: MeshHealth, hangs: float) -> None:
     if hangs > HANGS:
-        problems.append(
+        found.problems.append(
             f"its top stays {1e3 * hangs:.0f} mm off the skin, where nothing holds it up."
         )
-        options.append("--drape")
+        found.options.append("--drape")
     if health.longest_edge > LONG:
-        problems.append(
+        found.problems.append(
             f"edges up to {1e3 * health.longest_edge:.0f} mm: too long to fold, and they cut"
             " corners off limbs."
         )
-        options.append("--edge-length 20")
+        found.options.append("--edge-length 20")
     elif health.median_edge < _FINE:
-        notes.append(
+        found.notes.append(
             f"edges of {1e3 * health.median_edge:.1f} mm: finer than any map here; `physxnet fit"
             " --decimate 8` would make it quicker."
         )
-    outfit = None
-    if len(raw.parts) > 1:
-        kinds = _kinds(path, raw.parts, body)
-        if len(set(kinds.values())) > 1:
-            told = ", ".join(f"{name} is dressed by {kind}" for name, kind in kinds.items())
-            problems.append(f"it holds several garments, which are worn apart: {told}.")
-            words = [shlex.quote(f"{path}#{name}") for name in kinds]
-            outfit = f"physxnet inspect {' '.join(words)}"
-        else:
-            notes.append(
-                f"made of {len(raw.parts)} meshes ({', '.join(raw.parts)[:200]}): `{path}#NAME`"
-                " takes one of them."
-            )
+
+
+def _tell_parts(found: _Found, path: pathlib.Path, raw: StillMesh, body: Body) -> str | None:
+    """Says of what meshes the file consists; the command that looks at each, if it has to be."""
+    if len(raw.parts) < 2:
+        return None
+    kinds = _kinds(path, raw.parts, body)
+    if len(set(kinds.values())) > 1:
+        told = ", ".join(f"{name} is dressed by {kind}" for name, kind in kinds.items())
+        found.problems.append(f"it holds several garments, which are worn apart: {told}.")
+        return f"physxnet inspect {' '.join(shlex.quote(f'{path}#{name}') for name in kinds)}"
+    found.notes.append(
+        f"made of {len(raw.parts)} meshes ({', '.join(raw.parts)[:200]}): `{path}#NAME`"
+        " takes one of them."
+    )
+    return None
+
+
+def _tell_images(found: _Found, raw: StillMesh) -> None:
     looks = () if raw.polygons is None else raw.polygons.materials
     images = [m.texture for m in looks if m.texture is not None]
     lost = sorted({t.name for t in images if t.data is None})
     if lost:
-        notes.append(
+        found.notes.append(
             f"images that won't be put on it: {', '.join(lost)[:200]}. PNG or JPEG in the file's"
             " folder are, by the first set of texture coordinates."
         )
     elif images and raw.uv is None:
-        notes.append("its images won't be put on it: faces without texture coordinates.")
-    if posed:
-        notes.append("made for a T-pose: worn as it is, its sleeves are turned down with the arms.")
-    if health.components > 1:
-        notes.append(f"{health.components} parts that nothing joins: each moves by itself.")
-    if hit_rate < 1 - _MISSED:
-        notes.append(
-            f"{100 * (1 - hit_rate):.0f} % of the vertices' rays miss the body; they are bound to"
-            " the closest skin."
-        )
-    return Inspection(
-        path, unit, up, size, health, raw.count, float(np.median(np.abs(distance))),
-        float(distance.max()), hangs, inside, outward, garment.template, _apart(v), hit_rate,
-        tuple(problems), tuple(notes),
-        outfit or (_command(path, options) if problems else None),
-    )  # fmt: skip
+        found.notes.append("its images won't be put on it: faces without texture coordinates.")
 
 
 def _kinds(path: pathlib.Path, parts: tuple[str, ...], body: Body) -> dict[str, Template]:
