@@ -344,3 +344,25 @@ def test_one_explosion_does_not_stop_a_build(tmp_path, monkeypatch):
     meta = read_sequence(tmp_path / "walk").meta["top"]
     assert not meta["finite"] and not usable_garment(meta)
     assert meta["worst"] == {"strain_max": pytest.approx(0.3)}
+
+
+def test_an_action_begins_where_the_table_says(tmp_path):
+    walk = load_motion("walk", fps=30)
+    save_motion(tmp_path / "a.npz", walk)
+    got = load_action(tmp_path, Action("train", "walk", "a.npz", 1.0, 30, None))
+    np.testing.assert_allclose(got.root, walk.root[30:60], atol=1e-5)
+    np.testing.assert_allclose(got.rotations, walk.rotations[30:60], atol=1e-5)
+    assert got.name == "walk"
+
+
+def test_shards_part_the_actions_among_them(data_dir, tmp_path, monkeypatch):
+    done = []
+    monkeypatch.setattr(
+        _build, "_simulate", lambda config, at, name, action, *_: done.append(action.name)
+    )
+    config = DatasetConfig(splits=("train",), templates=("bottom",))
+    names = [a.name for a in read_protocol(data_dir / "mocap") if a.split == "train"]
+    for k in range(3):
+        done.clear()
+        count = build_dataset(config, tmp_path, data_dir / "mocap", shard=(k, 3))
+        assert done == names[k::3] and count == len(done) > 5

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import runpy
 import subprocess
 import sys
 
@@ -319,3 +320,15 @@ def test_a_clip_begins_without_a_jump(fps):
             stream, cloth = step(dresser, stream, q, p, fps=fps)
             thrown.append(cloth["bottom"])
         assert jumps(thrown)[:4].max() > 5.0 * now[4:].max()
+
+
+def test_an_export_moves_at_the_rate_that_it_is_for(dresser, motion, tmp_path):
+    """Velocities are metres a second: the same poses twice as fast are another cloth."""
+    pytest.importorskip("flatbuffers")
+    export_dresser(tmp_path, dresser, fps=60.0, platforms=("cpu",))
+    load = runpy.run_path(str(tmp_path / "dress.py"))["load"]
+    cloth, ok = load(tmp_path)(*motion)
+    run = jax.jit(clothe, static_argnames="fps")
+    usual, fast = (np.asarray(run(dresser, *motion, fps=f)["bottom"]) for f in (30.0, 60.0))
+    assert bool(ok.all()) and np.abs(fast - usual).max() > 1e-3
+    np.testing.assert_allclose(np.asarray(cloth["bottom"]), fast, atol=1e-5)

@@ -16,6 +16,7 @@ from physxnet_jax.dressing import (
     tuck_in,
     unbound_wearable,
 )
+from physxnet_jax.dressing._push_out import _off_skin
 from physxnet_jax.garment import template
 from physxnet_jax.geometry import each_frame, mesh_edges
 from physxnet_jax.models import skin_wearable
@@ -179,3 +180,16 @@ def test_a_top_far_from_trousers_is_as_it_is_without_them(body, rest):
     edges = mesh_edges(np.asarray(template("top").mesh.faces)).vertices
     more = np.asarray(top.least - alone)
     assert np.abs(more[edges[:, 0]] - more[edges[:, 1]]).max() < 0.006
+
+
+@pytest.mark.parametrize(
+    ("depth", "share"), [(-0.002, 1.0), (0.02, 1.0), (0.035, 0.5), (0.041, 0.0), (0.2, 0.0)]
+)
+def test_what_lies_deep_is_on_another_limbs_far_side_and_stays(depth, share):
+    """The lift fades out in the last centimetre before four."""
+    points = jnp.asarray([[0.3, -depth, 0.1]], jnp.float32)
+    feet = jnp.asarray([[0.3, 0.0, 0.1]]), jnp.asarray([[0.0, 1.0, 0.0]])
+    height, lift = _off_skin(points, feet, jnp.asarray([0.005]), jnp.asarray([jnp.inf]))
+    assert float(height[0]) == pytest.approx(-depth, abs=1e-6)
+    assert float(lift[0, 1]) == pytest.approx(share * (depth + 0.005), abs=1e-5)
+    assert not lift[0, ::2].any()

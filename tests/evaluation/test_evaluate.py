@@ -12,14 +12,20 @@ from physxnet_jax.evaluation import (
     check_sequence,
     error_tables,
     evaluate,
+    fold_strength,
     nearest_frame,
     pose_features,
     pose_network,
+    retime,
     skinning,
     training_frames,
 )
+from physxnet_jax.evaluation._penetration import Penetration
+from physxnet_jax.evaluation._strain import edge_strain
 from physxnet_jax.garment import template
+from physxnet_jax.geometry import vertex_normals
 from physxnet_jax.motion import load_motion, make_motion
+from physxnet_jax.simulation import Scene, prepare_scene
 
 META = {"engine": "test", "finite": True, "worst": {"penetration_max": 0.0}}
 BOTTOM = template("bottom").num_vertices
@@ -158,3 +164,53 @@ def test_a_check_finds_explosions_wrong_counts_and_stretched_cloth():
     torn.offsets["bottom"][::2, 1::2] -= 0.05
     wrong = {f.quantity for f in check_sequence(torn) if not f.holds}
     assert {"strain, 99 %", "jerk over that of skinning"} <= wrong
+
+
+def test_strain_and_folds_are_told_beside_those_of_the_reference():
+    rough = sequence(frames=6)
+    rough.offsets["bottom"] += np.random.default_rng(0).normal(0, 2e-3, (6, BOTTOM, 3)).astype("f4")
+    (row,) = measure({"lbs": skinning()}, [rough])
+    assembly = prepare_scene(Scene((template("bottom"),))).assembly
+    x = skinning()(rough.motion, "bottom").positions
+    y = x + rough.offsets["bottom"]
+    plain, wanted = (np.quantile(np.abs(edge_strain(assembly, p)), 0.99) for p in (x, y))
+    assert row.strain_p99 == pytest.approx(plain, rel=1e-3)
+    assert row.strain_p99_reference == pytest.approx(wanted, rel=1e-3) and wanted > 2 * plain
+    folds = [fold_strength(np.asarray(assembly.faces), p) for p in (x, y)]
+    assert (
+        row.fold_strength == pytest.approx(folds[0] / folds[1], rel=1e-3) and row.fold_strength < 1
+    )
+
+
+def test_cloth_that_has_no_room_is_counted_apart(monkeypatch):
+    def seen(assembly, motion, positions, *, frames, bare_skin):
+        inside = np.zeros((len(frames), BOTTOM), bool)
+        pinched, depth = inside.copy(), np.zeros(inside.shape)
+        inside[:, :200], pinched[:, :150] = True, True
+        depth[:, :150], depth[:, 150:200] = 0.03, 0.002
+        return Penetration(inside, depth, pinched, np.full(len(frames), np.nan))
+
+    monkeypatch.setattr("physxnet_jax.evaluation._evaluate.penetration", seen)
+    (row,) = measure({"lbs": skinning()}, [sequence(frames=6)])
+    assert row.penetration_share == pytest.approx(50 / BOTTOM)
+    assert row.pinched_share == pytest.approx(150 / BOTTOM)
+    assert row.penetration_mm == pytest.approx(2.0)
+
+
+def test_only_times_are_measured_again():
+    one = sequence(frames=6)
+    rows = measure({"lbs": skinning(), "other": skinning()}, [one])
+    slow = lambda motion, name: Answer(skinning()(motion, name).positions + 1.0, 77.0)  # noqa: E731
+    again = list(retime({"lbs": slow}, [one], rows))
+    assert again == [dataclasses.replace(rows[0], ms_per_frame=77.0), rows[1]]
+
+
+def test_a_check_finds_cloth_in_the_body():
+    sunk = sequence(frames=3)
+    skinned = jnp.asarray(skinning()(sunk.motion, "bottom").positions)
+    sunk.offsets["bottom"] -= 0.02 * np.asarray(
+        vertex_normals(skinned, template("bottom").mesh.faces)
+    )
+    found = {f.quantity: f for f in check_sequence(sunk)}
+    assert found["inside the body, share"].measured > 0.3
+    assert not found["inside the body, share"].holds

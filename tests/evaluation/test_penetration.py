@@ -9,7 +9,7 @@ from physxnet_jax.body import NUM_BODY_VERTICES
 from physxnet_jax.evaluation import edge_strain, penetration
 from physxnet_jax.garment import template
 from physxnet_jax.geometry import vertex_normals
-from physxnet_jax.motion import Motion
+from physxnet_jax.motion import Motion, animate
 from physxnet_jax.simulation import Gravity, Scene, prepare_scene
 
 
@@ -59,3 +59,22 @@ def test_frames_can_be_chosen(standing):
     some = penetration(assembly, motion, x, frames=np.asarray([0]), bare_skin=False)
     np.testing.assert_array_equal(some.cloth_inside[0], chosen.cloth_inside[0])
     assert np.isnan(some.skin_outside).all()
+
+
+def test_cloth_within_another_limb_is_inside_and_has_no_room(body, rest):
+    """An arm pressed into the flank: both limbs' cloth is above its own skin, yet inside."""
+    g = template("top")
+    assembly = prepare_scene(Scene((g,), (Gravity(),))).assembly
+    root = body.joint_positions(rest)[0][:1]
+    found = []
+    for angle in (60.0, -60.0):  # outwards, inwards
+        half = np.radians(angle) / 2
+        pose = np.asarray(body.a_pose()).copy()
+        pose[body.joint("LeftArm")] = [np.cos(half), 0.0, 0.0, np.sin(half)]
+        motion = Motion(jnp.asarray(pose[None], jnp.float32), root, 30.0)
+        x = np.asarray(animate(body, rest, g.rest_vertices(rest), g.skin, motion))
+        found.append(penetration(assembly, motion, x, bare_skin=False))
+    away, pressed = found
+    assert not away.cloth_inside.any() and not away.pinched.any()
+    assert pressed.cloth_inside.mean() > 0.07 and pressed.depth.max() > 0.05
+    assert pressed.pinched[pressed.cloth_inside].mean() > 0.9

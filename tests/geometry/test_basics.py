@@ -136,9 +136,27 @@ def test_bad_meshes_are_refused_with_a_sentence(vertices, faces, says):
         make_mesh(vertices, faces)
 
 
+@pytest.mark.parametrize(("corner", "says"), [(-1, "uv -1, but there are 3"), (3, "uv 3, but")])
+def test_a_corner_without_coordinates_is_named(corner, says):
+    with pytest.raises(MeshError, match=says):
+        make_mesh(np.eye(3), [[0, 1, 2]], np.zeros((3, 2)), [[0, 1, corner]])
+
+
 def test_the_known_miscomputation_of_jax_is_absent():
     """jax-ml/jax#39103: wrong rows in jit(vmap(matvec, reduce)) on CPU."""
     rows = np.random.default_rng(0).normal(size=(36_000, 3)).astype(np.float32)
     turn = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix().astype(np.float32)
     ours = jax.jit(jax.vmap(lambda r: jnp.sum((turn @ r) ** 2)))(rows)
     np.testing.assert_allclose(np.asarray(ours), (rows**2).sum(axis=1), rtol=1e-4)
+
+
+def test_normals_of_a_box_know_nothing_of_its_diagonals():
+    """One or two triangles of a side meet in a corner: angles count, not triangles."""
+    box = trimesh.creation.box((1, 1, 1))
+    n = vertex_normals(jnp.asarray(box.vertices, jnp.float32), jnp.asarray(box.faces, jnp.int32))
+    np.testing.assert_allclose(np.asarray(n), np.sign(box.vertices) / np.sqrt(3), atol=1e-5)
+
+
+def test_the_longest_border_comes_first():
+    faces = np.array([[0, 1, 2], [3, 4, 5], [3, 5, 6]])
+    assert [sorted(x.tolist()) for x in boundary_loops(faces)] == [[3, 4, 5, 6], [0, 1, 2]]

@@ -127,3 +127,30 @@ def test_the_distance_falls_along_its_gradient(body):
     np.testing.assert_allclose(
         np.asarray(jax.grad(squared)(p)), np.asarray(2.0 * (p - foot)), atol=1e-5
     )
+
+
+@pytest.mark.parametrize("size", [1e-2, 1e-3, 1e-4])
+def test_the_foot_on_a_small_triangle_lies_within_it(size):
+    """Only what has no area to speak of counts as a line: a millimetre of cloth has one."""
+    corners = jnp.asarray([[0, 0, 0], [size, 0, 0], [0, size, 0]], jnp.float32)
+    p = jnp.asarray([0.25 * size, 0.25 * size, size], jnp.float32)
+    weights, squared = closest_barycentric(*(x[:, None] for x in (p, *corners)))
+    np.testing.assert_allclose(np.asarray(weights)[:, 0], [0.5, 0.25, 0.25], atol=1e-3)
+    assert float(squared[0]) == pytest.approx(size**2, rel=1e-3)
+
+
+def test_signs_are_right_in_front_of_a_sharp_edge():
+    """Beyond the edge of a wedge a point lies behind the plane of one of its sides."""
+    wedge = trimesh.Trimesh(
+        [[0, 0, 0], [0, 0, 1], [1, 0.1, 0.5], [1, -0.1, 0.5]],
+        [[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]],
+    )
+    wedge.fix_normals()
+    mesh = make_mesh(wedge.vertices, wedge.faces)
+    points = np.random.default_rng(2).uniform([-0.5, -0.4, -0.2], [1.2, 0.4, 1.2], (600, 3))
+    height = np.einsum(
+        "fc,pfc->pf", wedge.face_normals, points[:, None] - wedge.triangles[None, :, 0]
+    )
+    clear = np.abs(height).min(axis=1) > 1e-3
+    ours = np.asarray(signed_distance(mesh, jnp.asarray(points, jnp.float32)))
+    assert ((ours < 0) == (height < 0).all(axis=1))[clear].all()

@@ -172,3 +172,28 @@ def test_a_header_that_promises_too_much_costs_nothing(tmp_path):
     path.write_bytes(struct.pack(">ii", 2**31 - 1, 2**31 - 1) + b"\0" * 64)
     with pytest.raises(FormatError, match="truncated"):
         read_mdd(path)
+
+
+def area_normals(x, faces):
+    n = np.zeros_like(x)
+    for k in range(3):
+        a, b, c = (x[faces[:, (k + i) % 3]] for i in range(3))
+        np.add.at(n, faces[:, k], np.cross(b - a, c - a))
+    return n / np.linalg.norm(n, axis=1, keepdims=True)
+
+
+def test_gltf_lights_every_frame_by_its_own_normals(tmp_path, clip):
+    """Morph targets add to the mesh's normals as they do to its points."""
+    pytest.importorskip("pygltflib")
+    (path,) = write_clip(tmp_path / "a.glb", clip, 25.0)
+    document, blob = read_glb(path)
+    for m, node in zip(clip, document["nodes"], strict=True):
+        (primitive,) = document["meshes"][node["mesh"]]["primitives"]
+        base = accessor(document, blob, primitive["attributes"]["NORMAL"])
+        # At seams of the chart vertices are doubled.
+        places = accessor(document, blob, primitive["attributes"]["POSITION"])
+        rows = [int(np.flatnonzero((m.positions[0] == p).all(axis=1))[0]) for p in places]
+        moved = [accessor(document, blob, t["NORMAL"]) for t in primitive["targets"]]
+        for k, x in enumerate(m.positions):
+            seen = base + (moved[k - 1] if k else 0.0)
+            np.testing.assert_allclose(seen, area_normals(x, m.faces)[rows], atol=1e-5)

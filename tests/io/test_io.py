@@ -278,3 +278,26 @@ def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
             read_card(tmp_path / "w")
     with pytest.raises(WeightsError, match="local"):
         load_predictor("second")
+
+
+def test_usd_tells_normals_extent_and_velocities_of_every_frame(tmp_path, clip):
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom
+
+    (path,) = write_clip(tmp_path / "a.usdc", clip, 24.0)
+    stage = usd.Stage.Open(str(path))
+    prims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+    for m, prim in zip(clip, prims, strict=True):
+        mesh = UsdGeom.Mesh(prim)
+        for k, x in enumerate(m.positions):
+            extent = np.asarray(mesh.GetExtentAttr().Get(k))
+            np.testing.assert_allclose(extent, [x.min(axis=0), x.max(axis=0)], atol=1e-6)
+            a, b, c = (x[m.faces[0, i]] for i in range(3))
+            # Vertex 1 has one face alone.
+            n = np.cross(b - a, c - a)
+            seen = np.asarray(mesh.GetNormalsAttr().Get(k))[1]
+            np.testing.assert_allclose(seen, n / np.linalg.norm(n), atol=1e-5)
+        last, before = (np.asarray(mesh.GetVelocitiesAttr().Get(k)) for k in (4, 3))
+        # Nothing comes to a halt where a clip ends.
+        np.testing.assert_allclose(last, before)
+        np.testing.assert_allclose(before, 24.0 * (m.positions[4] - m.positions[3]), rtol=1e-4)

@@ -1,5 +1,8 @@
 """A garment is the same one whichever format it comes in."""
 
+import base64
+import json
+
 import numpy as np
 import pytest
 import trimesh
@@ -161,3 +164,61 @@ def test_a_flat_shaded_stl_becomes_one_sheet(trousers, tmp_path):
     v, faces, _, _ = trousers
     trimesh.Trimesh(v, faces, process=False).export(tmp_path / "a.stl")
     assert inspect_garment(tmp_path / "a.stl").health.components == 1
+
+
+@pytest.mark.parametrize("kind", ["scale", "matrix", "usda"])
+def test_what_a_file_mirrors_has_its_outside_out(tmp_path, kind):
+    """A ball mirrored by its node or prim still encloses what is in it."""
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    x, faces = np.asarray(ball.vertices, "<f4") + np.float32([2, 0, 0]), np.asarray(ball.faces)
+    if kind == "usda":
+        pytest.importorskip("pxr")
+        path = tmp_path / "a.usda"
+        path.write_text(
+            '#usda 1.0\n(\n metersPerUnit = 1\n upAxis = "Y"\n)\ndef Mesh "ball"\n{\n'
+            f" int[] faceVertexCounts = {[3] * len(faces)}\n"
+            f" int[] faceVertexIndices = {faces.ravel().tolist()}\n"
+            f" point3f[] points = {[tuple(p) for p in x.astype(float).tolist()]}\n"
+            " double3 xformOp:scale = (-1, 1, 1)\n"
+            ' uniform token[] xformOpOrder = ["xformOp:scale"]\n}\n'
+        )
+    else:
+        pytest.importorskip("pygltflib")
+        blob = x.tobytes() + faces.astype("<u4").tobytes()
+        node = {"scale": {"scale": [-1, 1, 1]}}.get(
+            kind, {"matrix": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}
+        )
+        document = {
+            "asset": {"version": "2.0"},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": [{**node, "mesh": 0, "name": "ball"}],
+            "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+            "buffers": [
+                {
+                    "byteLength": len(blob),
+                    "uri": "data:application/octet-stream;base64,"
+                    + base64.b64encode(blob).decode(),
+                }
+            ],
+            "bufferViews": [
+                {"buffer": 0, "byteOffset": 0, "byteLength": x.nbytes},
+                {"buffer": 0, "byteOffset": x.nbytes, "byteLength": len(blob) - x.nbytes},
+            ],
+            "accessors": [
+                {"bufferView": 0, "componentType": 5126, "count": len(x), "type": "VEC3"},
+                {"bufferView": 1, "componentType": 5125, "count": faces.size, "type": "SCALAR"},
+            ],
+        }
+        path = tmp_path / "a.gltf"
+        path.write_text(json.dumps(document))
+    mesh = read_mesh(path)
+    assert mesh.vertices[:, 0].max() == pytest.approx(-1.0, abs=1e-6)
+    corner = mesh.vertices[mesh.faces] - [-2, 0, 0]
+    assert np.linalg.det(corner).sum() / 6 == pytest.approx(ball.volume, rel=1e-4)
+    assert mesh.polygons is not None
+    np.testing.assert_array_equal(
+        np.sort(mesh.polygons.corners.reshape(-1, 3)), np.sort(mesh.faces)
+    )
+    ring = mesh.vertices[mesh.polygons.corners.reshape(-1, 3)] - [-2, 0, 0]
+    assert np.linalg.det(ring).sum() > 0

@@ -9,6 +9,7 @@ import pytest
 from flax import nnx
 from scipy.spatial.transform import Rotation
 
+from physxnet_jax.garment import template
 from physxnet_jax.models import (
     PAPER,
     Discriminator,
@@ -17,6 +18,7 @@ from physxnet_jax.models import (
     ModelConfig,
     Normalisation,
     Predictor,
+    apply_offsets,
     ask_mirrored,
     at_precision,
     average_networks,
@@ -36,7 +38,7 @@ from physxnet_jax.models import (
     upsampling_kernel,
 )
 from physxnet_jax.motion import clip_transforms, load_motion
-from physxnet_jax.uv import bind, garment_map_rows, make_atlas
+from physxnet_jax.uv import bind, dress_body, garment_map, garment_map_rows, make_atlas
 
 NHWC = ("NHWC", "HWIO", "NHWC")
 
@@ -466,3 +468,23 @@ def test_a_stream_is_the_clip_frame_by_frame(worn, body, rest, inputs):
         for live, whole in zip(garments, clip, strict=True):
             np.testing.assert_allclose(np.asarray(live), np.asarray(whole[k]), atol=2e-5)
     assert np.abs(np.asarray(clip[0][-1] - clip[0][0])).max() > 0.01, "nothing moves"
+
+
+def test_a_dress_by_the_paper_begins_and_ends_on_joined_legs(body, rest):
+    """Its map at rest, from the hull of both legs, gives the dress back."""
+    atlas, g = make_atlas(64), template("dress")
+    rows = garment_map_rows(atlas, body, rest, g)
+    surface = make_surface(atlas, body, rest, {"dress": rows.valid})
+    worn = make_wearable(body, rest, g, bind(atlas, body, rest, g, rows.valid))
+    joined = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
+    np.testing.assert_allclose(surface.rest_dress, atlas.to_body @ joined, atol=1e-6)
+    np.testing.assert_allclose(worn.anchor, worn.binding.to_body @ joined, atol=1e-6)
+    offsets = garment_map(rows, g.mesh.vertices, surface.rest_dress)
+    turns, shifts = (
+        jnp.tile(jnp.eye(3), (len(body.parents), 1, 1)),
+        jnp.zeros((len(body.parents), 3)),
+    )
+    again = np.asarray(apply_offsets(worn, turns, shifts, offsets, "paper"))
+    gap = np.linalg.norm(again - np.asarray(g.mesh.vertices), axis=1)
+    skirt = np.asarray(g.mesh.vertices)[:, 1] < -0.15
+    assert np.median(gap[skirt]) < 0.025

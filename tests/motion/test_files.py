@@ -239,3 +239,19 @@ def test_blank_lines_and_tabs_of_other_exporters_are_read(tmp_path):
 def test_a_true_rate_is_of_files_alone():
     with pytest.raises(MotionError, match="'walk' is computed at any rate"):
         load_motion("walk", fps=30.0, source_fps=60.0)
+
+
+def test_a_skeleton_in_radians_is_the_one_in_degrees(tmp_path):
+    (tmp_path / "01.asf").write_text(ASF)
+    (tmp_path / "01_02.amc").write_text(AMC)
+    wanted = read_amc(tmp_path / "01_02.amc")
+    ten, twenty = np.radians([10.0, 20.0])
+    text = ASF.replace("angle deg", "angle rad").replace("axis 0 0 20", f"axis 0 0 {twenty:.9f}")
+    (tmp_path / "01.asf").write_text(text)
+    moved = AMC.replace("lfemur 10", f"lfemur {ten:.9f}").replace(
+        "lfemur 20", f"lfemur {twenty:.9f}"
+    )
+    (tmp_path / "01_02.amc").write_text(moved)
+    seen = read_amc(tmp_path / "01_02.amc")
+    np.testing.assert_allclose(seen.rotations, wanted.rotations, atol=1e-7)
+    assert np.abs(wanted.rotations[0, 1] - wanted.rotations[1, 1]).max() > 0.1

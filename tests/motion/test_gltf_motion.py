@@ -1,5 +1,6 @@
 """Motion from glTF and AMASS files, against the clip they were made from."""
 
+import base64
 import json
 import pathlib
 import runpy
@@ -19,6 +20,7 @@ from physxnet_jax.motion import (
     procedural_clip,
     read_gltf,
 )
+from physxnet_jax.motion._gltf_file import GltfFile
 
 TESTS = pathlib.Path(__file__).parents[1]
 _SAMPLES = runpy.run_path(str(TESTS / "samples.py"))
@@ -398,3 +400,80 @@ def test_broken_amass_files_are_refused(tmp_path, change, says):
         load_motion(path, fps=30.0)
     np.savez(path, **good)
     assert load_motion(path).num_frames == 4
+
+
+def document(folder, arrays, nodes, **more):
+    """A glTF of arrays one after another: each with its type, and with what else is said of it."""
+    blob, views, accessors = b"", [], []
+    for values, kind, said, stride in arrays:
+        data = values.tobytes()
+        view = {"buffer": 0, "byteOffset": len(blob), "byteLength": len(data)}
+        views.append(view | ({"byteStride": stride} if stride else {}))
+        dtype = {"f4": 5126, "i2": 5122, "u1": 5121}[values.dtype.str[1:]]
+        accessors.append(
+            {"bufferView": len(views) - 1, "componentType": dtype, "type": kind} | said
+        )
+        blob += data + b"\0" * (-len(data) % 4)
+    uri = "data:application/octet-stream;base64," + base64.b64encode(blob).decode()
+    told = {
+        "asset": {"version": "2.0"},
+        "buffers": [{"byteLength": len(blob), "uri": uri}],
+        "bufferViews": views,
+        "accessors": accessors,
+        "nodes": nodes,
+    }
+    path = folder / "a.gltf"
+    path.write_text(json.dumps(told | more))
+    return GltfFile(path)
+
+
+def test_whole_numbers_that_stand_for_fractions_and_rows_with_gaps_are_read(tmp_path):
+    """The specification's 3.11: f = max(c / 127, -1) and the like; 3.6.2.4: strides."""
+    short = np.array([[-32768, -32767, 16384, 32767]], "<i2")
+    byte = np.array([[0, 51, 255, 128]], "|u1")
+    rows = np.arange(24, dtype="<f4").reshape(3, 8)
+    file = document(
+        tmp_path,
+        [
+            (short, "VEC4", {"count": 1, "normalized": True}, None),
+            (byte, "VEC4", {"count": 1, "normalized": True}, None),
+            (byte, "VEC4", {"count": 1}, None),
+            (rows, "VEC3", {"count": 3, "byteOffset": 8}, 32),
+        ],
+        [{"name": "a"}],
+    )
+    np.testing.assert_allclose(file.accessor(0), [[-1, -1, 16384 / 32767, 1]])
+    np.testing.assert_allclose(file.accessor(1), byte / 255)
+    np.testing.assert_array_equal(file.accessor(2), byte)
+    np.testing.assert_array_equal(file.accessor(3), rows[:, 2:5])
+
+
+def test_a_node_may_stand_by_a_matrix(tmp_path):
+    turn = Rotation.from_euler("XYZ", [20, 50, -70], degrees=True).as_matrix()
+    m = np.eye(4)
+    m[:3, :3], m[:3, 3] = turn * [2.0, 3.0, 4.0], [5.0, 6.0, 7.0]
+    nodes = [{"name": "a", "matrix": m.T.ravel().tolist(), "children": [1]}]
+    nodes += [{"name": "b", "translation": [1.0, 1.0, 1.0]}]
+    file = document(tmp_path, [(np.zeros((1, 3), "<f4"), "VEC3", {"count": 1}, None)], nodes)
+    world = file.world()[0]
+    np.testing.assert_allclose(world[0], m, atol=1e-12)
+    np.testing.assert_allclose(world[1, :3, 3], turn @ [2.0, 3.0, 4.0] + [5, 6, 7], atol=1e-12)
+
+
+def test_an_animation_begins_with_its_first_key(tmp_path):
+    """Cut out of a longer one it begins at two seconds: nothing stands still until then."""
+    times = (2.0 + np.arange(4) / 10.0).astype("<f4")
+    places = np.array([[k, 0, 0] for k in range(4)], "<f4")
+    animation = {
+        "samplers": [{"input": 0, "output": 1}],
+        "channels": [{"sampler": 0, "target": {"node": 0, "path": "translation"}}],
+    }
+    file = document(
+        tmp_path,
+        [(times, "SCALAR", {"count": 4}, None), (places, "VEC3", {"count": 4}, None)],
+        [{"name": "a"}],
+        animations=[animation],
+    )
+    at, fps = file.frame_times()
+    assert fps == 10.0 and len(at) == 4
+    np.testing.assert_allclose(file.world(at)[:, 0, 0, 3], [0, 1, 2, 3], atol=1e-5)

@@ -8,12 +8,14 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
+from physxnet_jax.body import bone_directions
 from physxnet_jax.errors import MotionError
 from physxnet_jax.geometry import quaternion_multiply
 from physxnet_jax.motion import (
     CLIPS,
     _procedural,
     body_animation,
+    clip_transforms,
     foot_heights,
     load_motion,
     make_motion,
@@ -157,3 +159,34 @@ def test_limbs_that_turn_over_within_a_frame_are_told_of(body):
     # At ten frames a second a limb may turn three times as far between two.
     slow = load_motion("punch", fps=10)
     assert sudden_turns(body, slow) is None
+
+
+def test_a_person_of_another_shape_stands_as_straight(body):
+    """Built-in clips begin on straight legs, whatever way a shape's bones lean at rest."""
+    shape = body.shape(gender=1.0, weight_up=1.0, height_up=0.8)
+    clip = load_motion("stretch", fps=10.0, shape=shape)
+    world, _ = clip_transforms(body, body.rest_vertices(shape), clip)
+    ours, usual = bone_directions(body, shape), bone_directions(body)
+    legs = [body.joint(s + n) for s in ("Left", "Right") for n in ("UpLeg", "Leg")]
+    for j in legs:
+        np.testing.assert_allclose(world[0, j] @ ours[j], [0.0, -1.0, 0.0], atol=1e-3)
+    # The control: they lean another way than those of the default shape.
+    assert np.abs(ours - usual)[legs].max() > 5e-3
+
+
+@pytest.mark.parametrize(
+    ("name", "told", "says"),
+    [
+        ("walk", {"joint_map": {"Hips": "pelvis"}}, "has the body's"),
+        ("walk", {"joint_map": "none.toml"}, "has the body's"),
+        ("walk", {"skeleton": "none.asf"}, "for .amc files"),
+        ("own.npz", {"joint_map": {"Hips": "pelvis"}}, "has the body's"),
+        ("own.npz", {"skeleton": "none.asf"}, "for .amc files"),
+    ],
+)
+def test_what_a_motion_has_no_use_for_is_refused(tmp_path, name, told, says):
+    if name.endswith(".npz"):
+        save_motion(tmp_path / name, load_motion("walk", fps=5))
+        name = tmp_path / name
+    with pytest.raises(MotionError, match=says):
+        load_motion(name, **told)

@@ -13,6 +13,7 @@ from physxnet_jax.simulation import (
     XPBD,
     Bend,
     BodyContact,
+    Dihedral,
     Gravity,
     Implicit,
     Membrane,
@@ -145,3 +146,46 @@ def test_a_bending_stiffness_is_recovered_from_motion(body, rest):
         step = step * 0.5 if float(after * slope) < 0 else step
         at, slope = new, after
     assert float(jnp.exp(at)) == pytest.approx(3.0, rel=0.05)
+
+
+def test_a_rougher_cloth_is_that_of_a_factor_of_friction(body, rest):
+    """The kerchief on a head that tilts: twice the friction told is twice the friction made."""
+    skin = np.asarray(rest, np.float64)[:13380]
+    crown = skin[skin[:, 1].argmax()]
+    corner = tuple(float(c) for c in crown + [-0.09, 0.006, -0.09])
+    pose = jnp.repeat(body.a_pose()[None, None], 5, axis=0)
+    angle = 0.3 * jnp.linspace(0.0, 1.0, 5)
+    zero = jnp.zeros_like(angle)
+    turn = jnp.stack([jnp.cos(angle / 2), zero, zero, jnp.sin(angle / 2)], axis=1)
+    pose = pose.at[:, 0, 0].set(turn)
+    root = jnp.repeat(body.joint_positions(rest)[0][:1][None], 5, axis=0)
+
+    def roll(rub, **factors):
+        fabric = Fabric(stretch=200.0, bend=1e-4, friction=rub)
+        g = square_sheet(5, 0.18, corner=corner, fabric=fabric)
+        scene = prepare_scene(Scene((g,), (Gravity(), Stretch(), Bend(), BodyContact())))
+        system = scene.system(STEPS).rescaled(**factors)
+        x = jnp.asarray(g.mesh.vertices)[:, :, None]
+        state = State(x, jnp.zeros_like(x))
+        return np.asarray(advance(system, state, pose, root, solver=STEPS, fps=FPS)[1])
+
+    plain, made, told = roll(0.2), roll(0.4), roll(0.2, friction=2.0)
+    assert np.abs(made - told).max() < 1e-5 and np.abs(made - plain).max() > 1e-3
+
+
+def test_a_factor_of_bending_is_that_of_dihedral_cloth_too(body, rest):
+    pose = jnp.repeat(body.a_pose()[None, None], 5, axis=0)
+    root = jnp.repeat(body.joint_positions(rest)[0][:1][None], 5, axis=0)
+
+    def roll(fabric, **factors):
+        g = square_sheet(6, 0.2, pinned=np.arange(6), fabric=fabric)
+        scene = prepare_scene(Scene((g,), (Gravity(), Membrane(), Dihedral(), Pin())))
+        system = scene.system(STEPS).rescaled(**factors)
+        x = jnp.asarray(g.mesh.vertices)[:, :, None]
+        state = start_state(system, x, solver=STEPS, fps=FPS)
+        return np.asarray(advance(system, state, pose, root, solver=STEPS, fps=FPS)[1])
+
+    soft = Fabric(stretch=200.0, bend=2e-5)
+    stiff = dataclasses.replace(soft, stretch=400.0, bend=2e-3)
+    plain, made, told = roll(soft), roll(stiff), roll(soft, bend=100.0, stretch=2.0)
+    assert np.abs(made - told).max() < 2e-5 and np.abs(made - plain).max() > 2e-3

@@ -11,7 +11,7 @@ from physxnet_jax.errors import MissingDependencyError, SimulationError
 from physxnet_jax.evaluation import PEER_CASES, run_peer
 from physxnet_jax.garment import square_sheet
 from physxnet_jax.motion import animate, load_motion
-from physxnet_jax.simulation import Rollout, Scene, prepare_scene
+from physxnet_jax.simulation import Rollout, Scene, Status, prepare_scene
 from physxnet_jax.simulation._outside import _deepest, simulate_outside
 from physxnet_jax.simulation.newton import find_newton
 
@@ -115,3 +115,29 @@ def test_a_peer_is_judged_by_its_vertices_alone():
         "a_teleport_of_two_metres",
         "closed_armpits_and_crossed_arms",
     }
+
+
+RISING = """
+import pathlib, sys
+import numpy as np
+folder = pathlib.Path(sys.argv[-1])
+data = np.load(folder / "scene.npz")
+up = np.arange(len(data["cloth"]), dtype=np.float32)[:, None, None] * np.float32([0, 2.0, 0])
+np.savez(folder / "cloth.npz", positions=data["cloth"] + up, milliseconds=np.zeros(len(up)))
+"""
+
+
+def test_its_cloth_is_told_to_be_fast_in_metres_a_second(tmp_path):
+    """Two metres a frame are sixty a second, of somebody who stands still."""
+    script = tmp_path / "rising.py"
+    script.write_text(RISING)
+    scene = prepare_scene(Scene((square_sheet(4),), ()))
+    walk = load_motion("walk", fps=30.0)
+    still = dataclasses.replace(
+        walk,
+        rotations=jnp.repeat(walk.rotations[:1], 4, axis=0),
+        root=jnp.repeat(walk.root[:1], 4, axis=0),
+    )
+    out = simulate_outside("Rising", [sys.executable, str(script)], scene, still, {}, None)
+    np.testing.assert_allclose(out.diagnostics["speed_max"][1:], 60.0, rtol=1e-3)
+    assert (out.status[1:] & Status.FAST).all()

@@ -22,10 +22,12 @@ from physxnet_jax.simulation import (
     Scene,
     State,
     Stretch,
+    _rollout,
     advance,
     lead_in,
     prepare_scene,
     simulate,
+    simulate_batch,
     simulate_still,
 )
 
@@ -231,3 +233,50 @@ def test_the_lead_in_ends_in_the_first_frame_and_starts_at_rest(body):
     np.testing.assert_allclose(dot, 1.0, atol=1e-5)
     step = 2 * np.arccos(np.clip(np.abs((q[1:] * q[:-1]).sum(axis=2)), 0, 1))
     assert np.degrees(step).max() < 15
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.5, 3.0])
+def test_damping_is_an_exponential_decay(rate):
+    scene = prepare_scene(Scene((square_sheet(4),), (Damping(rate),)))
+    v = np.tile([0.0, 2.0, 0.0], (16, 1))
+    out = simulate_still(scene, 15, solver=XPBD(16, 2), velocity=v)
+    wanted = 2.0 * np.exp(-rate * np.arange(1, 16) / 30.0)
+    np.testing.assert_allclose(out.diagnostics["speed_max"], wanted, rtol=1e-3)
+
+
+def test_pins_go_along_with_the_skin_step_by_step():
+    """Within a block they have gone as far as time has: no jump at its start."""
+    (pin,) = prepare_scene(Scene((square_sheet(4, pinned=np.arange(4)),), (Pin(),))).effects
+    where, way = jnp.full((4, 3, 1), 0.5), jnp.ones((4, 3, 1))
+    still = jnp.zeros((16, 3, 1))
+    for share in (0.25, 1.0):
+        out = np.asarray(pin.project(still, still, (where, way), jnp.float32(share), (0.01, 0.25)))
+        np.testing.assert_allclose(out[:4], 0.5 + share, atol=1e-6)
+        assert not out[4:].any()
+
+
+def test_time_goes_on_from_block_to_block(monkeypatch):
+    """Wind and gusts are told the clip's time: zero is its first frame, not a block's."""
+    seen = []
+    real = _rollout.advance
+
+    def spy(*words, **more):
+        seen.append(float(more["time"]))
+        return real(*words, **more)
+
+    monkeypatch.setattr(_rollout, "advance", spy)
+    scene = prepare_scene(Scene((square_sheet(3),), (Gravity(),)))
+    simulate_batch(scene, [load_motion("balance", fps=10.0)], solver=XPBD(2, 1))
+    # A second and a half leads in, of which the last frame is the clip's first.
+    np.testing.assert_allclose(seen, -1.4 + np.arange(len(seen)), atol=1e-5)
+    assert len(seen) > 3
+
+
+def test_what_is_told_of_a_frame_is_of_that_frame():
+    """A sheet that falls from the lead-in's start on: its speed tells when it was looked at."""
+    scene = prepare_scene(Scene((square_sheet(3),), (Gravity(),)))
+    (out,) = simulate_batch(scene, [load_motion("balance", fps=10.0)], solver=XPBD(2, 1))
+    fallen = (14 + np.arange(len(out.finite))) / 10.0
+    np.testing.assert_allclose(out.diagnostics["speed_max"], 9.81 * fallen, rtol=1e-4)
+    moved = np.diff(out.positions[0][:, 0, 1]) * 10.0
+    np.testing.assert_allclose(-moved, 9.81 * (fallen[1:] - 0.025), rtol=1e-3)

@@ -1,5 +1,7 @@
 """Muon: orthogonal steps for kernels, Adam's for all else, none from what isn't finite."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -106,3 +108,36 @@ def test_a_step_that_is_not_finite_is_skipped_and_counted():
     assert not any(u.any() for u in updates)
     assert int(state.total_notfinite) == 1
     assert int(first_step(kernel_rate=0.02)[1].total_notfinite) == 0
+
+
+def sizes(config, steps, rate=1e-3):
+    """How far each step of an even gradient moves a number."""
+    tx = make_optimiser(config, rate, steps)
+    params = [jnp.zeros(3)]
+    state, out = tx.init(params), []
+    with jax.numpy_dtype_promotion("standard"):
+        for _ in range(steps):
+            updates, state = tx.update([jnp.ones(3)], state, params)
+            out.append(float(-updates[0][0]))
+    return np.asarray(out)
+
+
+def test_cosine_rises_over_a_fiftieth_and_falls_to_nothing_while_constant_stays():
+    np.testing.assert_allclose(sizes(TrainConfig(), 100), 1e-3, rtol=1e-3)
+    rate = sizes(dataclasses.replace(TrainConfig(), schedule="cosine"), 100)
+    assert rate[0] == pytest.approx(5e-4, rel=1e-2) and rate.max() == pytest.approx(1e-3, rel=1e-3)
+    assert rate.argmax() == 2 and (np.diff(rate[2:]) < 0).all() and rate[-1] < 1e-5
+    assert rate[51] == pytest.approx(5e-4, rel=0.03)
+
+
+@pytest.mark.parametrize("momentum", [0.5, 0.9])
+def test_adams_momentum_is_the_one_asked_for(momentum):
+    config = dataclasses.replace(TrainConfig(), momentum=momentum)
+    ours, theirs = make_optimiser(config, 1e-3, 10), optax.adam(1e-3, b1=momentum)
+    params = [jnp.zeros(3)]
+    a, b = ours.init(params), theirs.init(params)
+    with jax.numpy_dtype_promotion("standard"):
+        for g in (1.0, -3.0, 0.5):
+            x, a = ours.update([jnp.full(3, g)], a, params)
+            y, b = theirs.update([jnp.full(3, g)], b, params)
+            np.testing.assert_allclose(np.asarray(x[0]), np.asarray(y[0]), rtol=1e-5)

@@ -13,7 +13,7 @@ from physxnet_jax.data import Sequence
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.evaluation import network, skinning
 from physxnet_jax.garment import template
-from physxnet_jax.models import PAPER, Inputs, ModelConfig
+from physxnet_jax.models import PAPER, Inputs, ModelConfig, make_surface
 from physxnet_jax.motion import load_motion
 from physxnet_jax.training import (
     TrainConfig,
@@ -30,10 +30,11 @@ from physxnet_jax.training import (
     train,
     vertex_loss,
 )
-from physxnet_jax.training._batches import MAX_OFFSET, load_frames
+from physxnet_jax.training._batches import MAX_OFFSET, load_frames, target_offsets
 from physxnet_jax.training._checkpoint import Checkpoints
 from physxnet_jax.training._step import TrainState
 from physxnet_jax.training._watch import Players, Validation
+from physxnet_jax.uv import garment_map_rows, make_atlas
 
 CONFIG = TrainConfig(
     model=ModelConfig(resolution=32, width=4, templates=("bottom", "top")),
@@ -430,3 +431,59 @@ def test_the_mean_of_the_accuracy_goes_on_where_it_was():
         else:
             got = rest.update(seen)
     assert got == want
+
+
+def test_targets_of_the_papers_family_begin_on_the_skin(body, rest):
+    """At rest, without an offset: from each texel to the cloth that its ray meets."""
+    atlas, g = make_atlas(32), template("bottom")
+    rows = garment_map_rows(atlas, body, rest, g)
+    surface = make_surface(atlas, body, rest, {"bottom": rows.valid})
+    joints = len(body.parents)
+    turns, shifts = jnp.tile(jnp.eye(3), (1, joints, 1, 1)), jnp.zeros((1, joints, 3))
+    worn = g.rest_vertices(rest)
+    valid = np.asarray(rows.valid)
+    common = (rows, worn, g.skin, surface.rest, surface.weights, turns, shifts)
+    for up in (0, 100):  # tenths of a millimetre
+        stored = jnp.zeros((1, len(worn), 3), jnp.int16).at[..., 1].set(up)
+        seen = np.asarray(target_offsets(stored, *common, "paper"))[0][valid]
+        wanted = np.asarray(rows @ worn - surface.rest)[valid] + [0.0, 1e-4 * up, 0.0]
+        np.testing.assert_allclose(seen, wanted, atol=1e-5)
+        local = np.asarray(target_offsets(stored, *common, "local"))[0][valid]
+        np.testing.assert_allclose(local, np.tile([0.0, 1e-4 * up, 0.0], (len(seen), 1)), atol=1e-6)
+
+
+def test_the_loss_is_the_sum_that_the_weight_says_and_errors_are_millimetres(tmp_path):
+    data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
+    config = dataclasses.replace(CONFIG, l1_weight=10.0, validation=("b",), validate_every=1)
+    train(config, data, tmp_path, steps=1)
+    log = read_metrics(tmp_path)
+    (told,) = (x for x in log if "loss" in x)
+    assert told["loss"] == pytest.approx(told["adversarial"] + 10.0 * told["l1"], rel=1e-4)
+    # Offsets are up to two centimetres: so is the error of a network that knows nothing.
+    wanted = 1e3 * np.abs(data[1].offsets["bottom"]).mean()
+    (measured,) = (x["validation_mm"] for x in log if "validation_mm" in x)
+    assert 0.3 * wanted < measured < 5.0 * wanted
+    assert 0.3 * wanted < told["l1_mm_bottom"] < 5.0 * wanted
+
+
+def test_another_seed_sees_frames_in_another_order():
+    a, b = (np.concatenate([batch_indices(40, 8, s, k) for k in range(5)]) for s in (0, 1))
+    assert sorted(a) == sorted(b) and not np.array_equal(a, b)
+
+
+def test_the_weights_that_measured_best_are_handed_back(tmp_path, monkeypatch):
+    """Best after two of four steps: what comes back is the run of two."""
+    data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
+    config = dataclasses.replace(CONFIG, adversarial=False, validation=("b",), validate_every=1)
+    found = {}
+    for steps in (2, 4):
+        told = iter([3.0, 1.0, 2.0, 2.5])
+        monkeypatch.setattr(
+            "physxnet_jax.training._loop._validate",
+            lambda *_, told=told: ({"validation_mm": next(told)}, {}),
+        )
+        found[steps] = jax.tree.leaves(
+            train(config, data, tmp_path / str(steps), steps=steps).state
+        )
+    for a, b in zip(found[2], found[4], strict=True):
+        np.testing.assert_array_equal(np.asarray(a), np.asarray(b))

@@ -87,7 +87,10 @@ def make_mesh(
             f" [uvs, 2] and {f.shape}."
         )
     if tf.min() < 0 or tf.max() >= len(t):
-        raise MeshError(f"{name}: a corner names uv {tf.max()} of {len(t)}.")
+        raise MeshError(
+            f"{name}: a corner names uv {tf.min() if tf.min() < 0 else tf.max()}, but there are"
+            f" {len(t)} (0 to {len(t) - 1})."
+        )
     return TriMesh(
         jnp.asarray(v),
         jnp.asarray(f.astype(np.int32)),

@@ -207,7 +207,9 @@ def _moved(file: GltfFile, part: Moving, world: Float[np.ndarray, "frames 4 4"])
     _check_size(file, len(world), part.positions.shape[1])
     x = np.broadcast_to(part.positions, (len(world), *part.positions.shape[1:]))
     turned = np.einsum("fab,fvb->fva", world[:, :3, :3], x) + world[:, None, :3, 3]
-    return dataclasses.replace(part, positions=turned.astype(np.float32))
+    part = dataclasses.replace(part, positions=turned.astype(np.float32))
+    # What mirrors turns faces round (glTF 2.0, 3.7.4).
+    return part if np.linalg.det(world[0, :3, :3]) >= 0 else part.reversed()
 
 
 def _skinned(

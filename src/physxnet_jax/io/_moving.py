@@ -36,6 +36,16 @@ class Moving:
     bind: Float[np.ndarray, "vertices 3"] | None = None
     polygons: Polygons | None = None
 
+    def reversed(self) -> "Moving":
+        """The same with its faces the other way round: what is mirrored shows its inside."""
+        p = self.polygons
+        return dataclasses.replace(
+            self,
+            faces=self.faces[:, ::-1],
+            uv_faces=None if self.uv_faces is None else self.uv_faces[:, ::-1],
+            polygons=None if p is None else p.reversed(np.arange(len(p.counts))),
+        )
+
 
 def named(
     path: pathlib.Path, parts: Sequence[Moving], name: str | None, advice: str

@@ -133,6 +133,7 @@ def _meshes(
         if len(codes) * points * 3.0 > _MOST:
             raise FormatError(f"{path}: {len(codes)} frames of {points:,} points. Cut the clip.")
         x = np.zeros((len(codes), len(first), 3), np.float32)
+        mirrored = False
         for k, code in enumerate(codes):
             local = np.asarray(mesh.GetPointsAttr().Get(code), float)
             if local.shape != x.shape[1:]:
@@ -143,13 +144,15 @@ def _meshes(
                 world = np.asarray(skin.Get(), float)
                 if world.shape != (4, 4):
                     raise FormatError(f"{path}: {prim.GetPath()} is bound by no matrix.")
+            mirrored = mirrored or (k == 0 and np.linalg.det(world[:3, :3]) < 0)
             x[k] = unit * (local @ world[:3, :3] + world[3, :3])
         uv, rows = _chart(prim, np.asarray(corners))
         drawn = (
             _polygons(path, prim, np.asarray(counts), np.asarray(corners), rows) if bound else None
         )
         uv_faces = None if rows is None else rows[slots]
-        parts.append(Moving(prim.GetName(), x, faces, uv, uv_faces, polygons=drawn))
+        part = Moving(prim.GetName(), x, faces, uv, uv_faces, polygons=drawn)
+        parts.append(part.reversed() if mirrored else part)
     return parts
 
 

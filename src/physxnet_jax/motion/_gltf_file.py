@@ -137,6 +137,8 @@ class GltfFile:
             scale = np.linalg.norm(m[:3, :3], axis=0)
             if (scale < 1e-12).any():
                 raise self.broken(f"node {node} is scaled to nothing")
+            # What mirrors is no rotation.
+            scale = scale if np.linalg.det(m[:3, :3]) > 0 else -scale
             turn = Rotation.from_matrix(m[:3, :3] / scale).as_quat()
             out = {"translation": m[:3, 3], "rotation": turn, "scale": scale}
         if any(

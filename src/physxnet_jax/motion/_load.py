@@ -74,6 +74,11 @@ def fitted_motion(
 ) -> Motion:
     """What was read, on the body's skeleton."""
     if isinstance(read, Motion):
+        if joint_map is not None:
+            raise MotionError(
+                f"joint_map is for skeletons of other names; '{read.name}' has the body's. Leave"
+                " it out."
+            )
         return read
     if isinstance(joint_map, str | pathlib.Path):
         joint_map = read_joint_map(joint_map)
@@ -104,6 +109,8 @@ def read_motion(
             raise MotionError(f"{name} is {rate}, expected a positive number.")
     path = pathlib.Path(motion)
     suffix = path.suffix.lower()
+    if skeleton is not None and suffix != ".amc":
+        raise MotionError(f"{motion}: a skeleton (.asf) is for .amc files. Leave it out.")
     if suffix == ".bvh":
         read = read_bvh(path)
     elif suffix == ".amc":

@@ -114,3 +114,57 @@ def test_a_flag_in_a_storm_keeps_its_size(solver, stretch):
         out = simulate_still(prepare_scene(Scene((flag,), effects)), 15, solver=solver)
         assert out.finite.all() and out.diagnostics["speed_max"].max() < 3 * speed
         assert out.diagnostics["strain_p99"].max() < 0.8
+
+
+def blown(air, time, shift=(0.0, 0.0, 0.0)):
+    """The wind at the vertices of a sheet at a time [m/s]."""
+    (effect,) = prepare_scene(
+        Scene((square_sheet(12, 1.0, corner=(3.0, 0.0, 0.0)),), (air,))
+    ).effects
+    rest = np.asarray(square_sheet(12, 1.0, corner=(3.0, 0.0, 0.0)).mesh.vertices)
+    base = jnp.asarray(rest + np.asarray(shift), jnp.float32)[:, :, None]
+    wind = effect.begin(base, None, None, Clock(jnp.float32(time), 0.01), ())[1]
+    return np.asarray(wind)[:, :, 0]
+
+
+@pytest.mark.parametrize("tangent", [0.02, 0.2])
+def test_wind_along_a_sheet_drags_by_the_other_coefficient(tangent):
+    """Edge-on: du/dt = -k u^2 with k = rho C_t / (2 density), so u = u0 / (1 + k u0 t)."""
+    out = roll(Air(wind=(4.0, 0.0, 0.0), tangent=tangent), 60, effects=())
+    v = (out.positions[0][-1] - out.positions[0][-2])[:, 0].mean() * 30.0
+    k = 1.2 * tangent / (2 * 0.15)
+    assert v == pytest.approx(4.0 - 4.0 / (1 + k * 4.0 * (60 - 0.5) / 30.0), rel=0.02)
+
+
+@pytest.mark.parametrize("period", [0.5, 4.0])
+def test_a_gust_is_strongest_after_a_quarter_of_its_period(period):
+    air = Air(wind=(0.0, 3.0, 0.0), gust=0.8, period=period)
+    for share, swell in ((0.0, 1.0), (0.25, 1.8), (0.5, 1.0), (0.75, 0.2)):
+        np.testing.assert_allclose(blown(air, share * period)[:, 1], 3.0 * swell, atol=1e-4)
+
+
+def test_eddies_travel_with_the_wind():
+    """What was here blows a metre downwind after a twentieth of a second at 20 m/s."""
+    air = Air(wind=(20.0, 0.0, 0.0), turbulence=0.1)
+    mean = np.array([20.0, 0.0, 0.0])
+    first, there, here = (
+        blown(air, t, s) - mean for t, s in ((0.0, (0, 0, 0)), (0.05, (1, 0, 0)), (0.05, (0, 0, 0)))
+    )
+    size = np.sqrt(np.mean(first**2))
+    assert np.sqrt(np.mean((there - first) ** 2)) < 0.4 * size
+    assert np.sqrt(np.mean((here - first) ** 2)) > 0.8 * size
+
+
+def test_wind_changes_within_a_frame():
+    """Frames of a second: all of a gust's half period lies in one."""
+    scene = prepare_scene(
+        Scene((square_sheet(4, 0.3, fabric=STIFF),), (Air(wind=(0.0, 1.0, 0.0), gust=1.0),))
+    )
+    steady = prepare_scene(
+        Scene((square_sheet(4, 0.3, fabric=STIFF),), (Air(wind=(0.0, 1.0, 0.0)),))
+    )
+    a, b = (
+        simulate_still(s, 1, solver=XPBD(64, 16), fps=1.0).positions[0][0][:, 1].mean()
+        for s in (scene, steady)
+    )
+    assert a > 1.1 * b

@@ -27,6 +27,7 @@ from physxnet_jax.simulation import (
     simulate,
     simulate_still,
 )
+from physxnet_jax.simulation.effects._pairs import Pairs, keep_apart
 
 STEPS = XPBD(32, 4)
 
@@ -168,3 +169,51 @@ def test_contact_of_cloth_needs_no_clock():
         e.begin(x, None, None, Clock(jnp.float32(t), 0.01), e.initial(1)).pairs for t in (0.0, 5.0)
     ]
     np.testing.assert_array_equal(pairs[0].height, pairs[1].height)
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3, 10.0])
+def test_cloth_that_is_pressed_on_cloth_slides_as_far_as_friction_lets_it(friction):
+    """A vertex 3 mm too deep that slid by 10 mm over a held triangle."""
+    one = lambda *x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    pairs = Pairs(
+        jnp.zeros((1, 1), jnp.int32),
+        jnp.asarray([[[1]], [[2]], [[3]]], jnp.int32),
+        jnp.full((3, 1, 1), 1 / 3),
+        one(0, 1, 0)[None, :, None],
+        one(0.001)[None, None],
+        jnp.ones((1, 1, 1)),
+    )
+    start = jnp.zeros((4, 3, 1))
+    moved = start.at[0, :, 0].set(one(0.010, -0.002, 0.0))
+    mass = one(1, 0, 0, 0)[:, None, None]
+    law = SelfContact(gap=0.002, friction=friction, leave=1.0)
+    clock = Clock(jnp.float32(0.0), 1.0)
+    out = np.asarray(keep_apart(moved, start, pairs, mass, law, clock, jnp.float32(1.0)))[..., 0]
+    left = 0.010 - min(friction * 0.003, 0.010)
+    np.testing.assert_allclose(out[0], [left, 0.001, 0.0], atol=1e-6)
+    assert not out[1:].any()
+
+
+def test_self_contact_is_of_each_garment_with_itself():
+    """A sheet a millimetre above another: as one garment they meet, as two they don't."""
+    low, high = square_sheet(6, 0.2), square_sheet(6, 0.2, corner=(0.0, 0.001, 1.5))
+    v = np.concatenate([np.asarray(g.mesh.vertices) for g in (low, high)])
+    f = np.concatenate([np.asarray(low.mesh.faces), np.asarray(high.mesh.faces) + 36])
+    for garments, meet in (((free_garment(v, f),), True), ((low, high), False)):
+        (contact,) = prepare_scene(Scene(garments, (SelfContact(),))).effects
+        near, _ = contact.nearest(jnp.asarray(v, jnp.float32))
+        other = (np.asarray(near) >= 36) != (np.arange(72) >= 36)
+        assert bool((other & (np.asarray(near) >= 0)).any()) == meet
+
+
+@pytest.mark.parametrize(("limbs", "meet"), [((1, 0), True), ((3, 0), True), ((3, 1), False)])
+def test_layers_meet_where_limbs_adjoin(limbs, meet):
+    """A sleeve by the hip is no layer over the trousers' leg."""
+    low, high = square_sheet(6, 0.2), square_sheet(6, 0.2, corner=(0.0, 0.002, 1.5))
+    scene = prepare_scene(Scene((low, high), (LayerContact(),)))
+    (layers,) = scene.effects
+    layers = dataclasses.replace(layers, label=jnp.repeat(jnp.asarray(limbs, jnp.int32), 36))
+    x = jnp.asarray(scene.assembly.rest, jnp.float32)[:, :, None]
+    clock = Clock(jnp.float32(0.0), 0.01)
+    pairs = layers.begin(x, None, None, clock, layers.initial(1)).pairs
+    assert bool((pairs.active > 0).any()) == meet

@@ -9,7 +9,7 @@ import pytest
 
 from physxnet_jax.body import NUM_BODY_VERTICES
 from physxnet_jax.garment import template
-from physxnet_jax.geometry import closest_points
+from physxnet_jax.geometry import closest_points, vertex_normals
 from physxnet_jax.motion import Motion, animate, load_motion
 from physxnet_jax.simulation import (
     STANDARD,
@@ -17,6 +17,7 @@ from physxnet_jax.simulation import (
     BodyContact,
     Clock,
     Pin,
+    Placed,
     Scene,
     prepare_scene,
     simulate,
@@ -164,3 +165,38 @@ def test_limbs_share_the_room_between_them(body, rest):
     )
     assert (out.diagnostics["pinched"] > 10).all()
     assert out.diagnostics["strain_p99"].max() < 0.5
+
+
+@pytest.mark.parametrize("push", [1e-3, 1.0])
+def test_no_correction_is_larger_than_asked_for(push):
+    """Trousers 12 mm in the skin, one substep."""
+    g = template("bottom")
+    (contact,) = prepare_scene(Scene((g,), (BodyContact(push=push),))).effects
+    x = g.mesh.vertices - 0.012 * vertex_normals(g.mesh.vertices, g.mesh.faces)
+    skin = Placed(contact.skin.rest[:, :, None], contact.skin.normals[:, :, None])
+    begun = contact.begin(
+        x[:, :, None], skin, skin, Clock(jnp.float32(0.0), 0.01), contact.initial(1)
+    )
+    still = jnp.zeros((len(x), 3, 1))
+    moved = contact.project(still, still, begun, jnp.float32(1.0), (0.001, 1.0))
+    far = np.linalg.norm(np.asarray(moved)[..., 0], axis=1).max()
+    assert far == pytest.approx(push, rel=1e-3) if push < 0.01 else 0.005 < far < 0.03
+
+
+def test_cloth_that_goes_along_with_the_skin_does_not_rub():
+    """Trousers 2 mm too deep on skin that moves sideways by a centimetre, as they do."""
+    g = template("bottom")
+    (contact,) = prepare_scene(Scene((g,), (BodyContact(),))).effects
+    x = g.mesh.vertices - 0.004 * vertex_normals(g.mesh.vertices, g.mesh.faces)
+    way = jnp.asarray([0.006, 0.0, 0.008], jnp.float32)[None, :, None]
+    points, normals = contact.skin.rest[:, :, None], contact.skin.normals[:, :, None]
+    before, after = Placed(points, normals), Placed(points + way, normals)
+    clock = Clock(jnp.float32(0.0), 0.01)
+    begun = contact.begin(x[:, :, None], before, after, clock, contact.initial(1))
+    still = jnp.zeros((len(x), 3, 1))
+    unit = begun.unit
+    for moved, rubs in ((still + way, False), (still, True)):
+        gap = contact.project(moved, still, begun, jnp.float32(1.0), (0.01, 1.0)) - moved
+        along = gap - jnp.sum(gap * unit, axis=1, keepdims=True) * unit
+        assert float(jnp.abs(gap).max()) > 1e-3
+        assert (float(jnp.abs(along).max()) > 1e-4) == rubs
