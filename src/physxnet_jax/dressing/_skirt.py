@@ -30,9 +30,6 @@ _FACING = 0.25
 # A leg is met in full where the way out passes this near a skin point, not at all where
 # it stays this far [m^2].
 _HIT, _MISS = 0.03**2, 0.05**2
-# A leg carries cloth in full where the nearest skin faces away from the way out by this cosine,
-# not at all where it faces along it by as much: there the skin itself is the nearer way.
-_BEHIND = 0.2
 # Cloth isn't carried farther than this by a leg [m].
 _FARTHEST = 0.25
 _NOWHERE = 1e3
@@ -194,8 +191,7 @@ def skirt_lift(
 
     A leg in front of the vertex, seen along the way out of the skirt, carries it: so a
     leg that comes forward takes the front of the skirt along instead of poking through
-    it. Beside a leg, and beneath the skin of its near side, the vertex keeps off the
-    nearest skin: along the way out it would pass its neighbours. The two blend.
+    it. Beside a leg, the vertex keeps off the nearest skin. The two blend.
 
     Args:
         meeting: Where it may meet the legs.
@@ -214,17 +210,10 @@ def skirt_lift(
     foot, normal = front
     slope = jnp.maximum(jnp.sum(normal * outward, axis=1), _FACING)
     way = (jnp.sum((foot - points) * normal, axis=1) + least) / slope
-    facing = jnp.sum(up * outward, axis=1)
-    share = _smooth((_MISS - cost) / (_MISS - _HIT))
-    share = (share * _smooth(0.5 - 0.5 * facing / _BEHIND))[:, None]
+    share = jnp.clip((_MISS - cost) / (_MISS - _HIT), 0.0, 1.0)
+    share = (share * share * (3 - 2 * share))[:, None]
     long = jnp.clip(way, 0.0, _FARTHEST)[:, None] * outward
     return short + share * (long - short), height
-
-
-def _smooth(x: Float[Array, "*rows"]) -> Float[Array, "*rows"]:
-    """From 0 at 0 to 1 at 1, level at both ends and beyond."""
-    x = jnp.clip(x, 0.0, 1.0)
-    return x * x * (3 - 2 * x)
 
 
 def skin_foot(
