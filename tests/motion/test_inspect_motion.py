@@ -152,3 +152,8 @@ def test_a_problem_is_an_exit_code(walk, tmp_path, capsys):
     save_motion(tmp_path / "a.npz", dataclasses.replace(walk, root=jnp.asarray(far)))
     assert main(["inspect", str(tmp_path / "a.npz")]) == 1
     assert "wrong: its hips go at" in capsys.readouterr().out
+
+
+def test_what_is_said_of_motions_is_not_ignored_for_a_garment(capsys):
+    assert main(["inspect", "shirt.obj", "--source-fps", "60"]) == 2
+    assert "--source-fps is for motions" in " ".join(capsys.readouterr().err.split())

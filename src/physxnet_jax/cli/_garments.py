@@ -26,17 +26,18 @@ def inspect(command: Inspect, console: Console) -> int:
     """Shows every file; 1 if one of them needs mending."""
     if not command.files:
         raise MeshError("no file to look at: name one, as in `physxnet inspect my_shirt.obj`.")
+    of_motion = {
+        "source_fps": command.source_fps,
+        "skeleton": command.skeleton,
+        "joint_map": command.joint_map,
+    }
+    told = [f"--{k.replace('_', '-')}" for k, v in of_motion.items() if v is not None]
     found: list[Inspection | MotionInspection] = []
     for file in command.files:
         if command.motion or _is_motion(file):
-            found.append(
-                inspect_motion(
-                    file,
-                    source_fps=command.source_fps,
-                    skeleton=command.skeleton,
-                    joint_map=command.joint_map,
-                )
-            )
+            found.append(inspect_motion(file, **of_motion))
+        elif told:
+            raise MeshError(f"{told[0]} is for motions; {file} is a garment. Look at it apart.")
         else:
             found.append(inspect_garment(file))
         if not command.json:
@@ -119,11 +120,10 @@ def _show(found: Inspection | MotionInspection, console: Console) -> None:
 
 
 def _of_motion(found: MotionInspection) -> list[tuple[str, str]]:
-    joints = f"{found.joints}, {found.carried} of the body's follow them"
     return [
         ("frames", f"{found.frames:,} at {found.fps:g} a second: {found.seconds:.2f} s"),
         ("names of joints", found.skeleton),
-        ("joints", joints if found.joints else "-"),
+        ("joints", f"{found.joints}, {found.carried} of the body's follow them"),
         ("turns from", found.reference),
         ("unit", found.unit or "none of the usual ones; it doesn't matter"),
         ("way of the hips", f"{found.travelled:.1f} m, at up to {found.fastest:.1f} m/s"),

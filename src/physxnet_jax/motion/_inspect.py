@@ -4,6 +4,7 @@ import dataclasses
 import pathlib
 import shlex
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,7 +16,7 @@ from ._motion import Motion, resample
 from ._procedural import CLIPS
 from ._reference import reference_pose, stands, upright
 from ._retarget import foot_heights, joint_index, leg_length
-from ._skeletons import find_joint_map, nearest_joint_map, read_joint_map
+from ._skeletons import find_joint_map, read_joint_map
 from ._source import SourceClip
 
 # Units of length by how many metres they are; CMU's lab has one of its own.
@@ -120,63 +121,90 @@ def inspect_motion(
         options += ["--source-fps", f"{source_fps:g}"]
     read = read_motion(motion, source_fps=source_fps, skeleton=skeleton, body=body, shape=shape)
     clip = fitted_motion(read, body, joint_map=told, shape=shape)
-    names = {"skeleton": "built-in body", "reference": "its rest pose", "unit": "m"}
-    joints, carried = len(body.joint_names), set(body.joint_names)
-    if isinstance(read, SourceClip):
-        index = joint_index(read, body, told)
-        joints, carried = len(read.names), set(index)
-        names = {
-            "skeleton": find_joint_map(read)[0] if told is None else "own map",
-            "reference": _reference(read, index),
-            "unit": _unit(read, index, body, shape),
-        }
-    steady = clip if clip.fps <= _RATE else resample(clip, _RATE)
-    problems, notes, measured = _course(body, clip, steady, shape)
-    left_out = tuple(n for n in body.joint_names if n not in carried and n.endswith(_FELT))
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    found, course = _skeleton(read, told, body, rest), _course(body, clip, rest)
+    left_out = tuple(n for n in body.joint_names if n not in found.carried and n.endswith(_FELT))
+    notes = list(course.notes)
     if left_out:
         notes.append(f"{', '.join(left_out)} follow their parents: the skeleton has no such joint.")
-    if isinstance(read, SourceClip) and told is not None:
-        added = sorted(set(carried) - set(told))
-        if added:
-            family, _ = nearest_joint_map(read)
-            notes.append(f"{', '.join(added)} are taken from the names of {family}.")
+    if found.added:
+        notes.append(f"{', '.join(found.added)} are taken from names that are known.")
     subject = pathlib.Path(str(motion)).stem.partition("_")[0].lstrip("0")
-    if subject in _SLOW_SUBJECTS and clip.fps == 120 and str(names["skeleton"]).startswith("cmu"):
+    if subject in _SLOW_SUBJECTS and clip.fps == 120 and found.family.startswith("cmu"):
         notes.append(
             f"CMU's subject {subject} was captured at 60 frames a second, whatever files say:"
             " --source-fps 60."
         )
     if clip.fps != _RATE and str(motion) not in CLIPS:
         notes.append(f"{clip.fps:g} frames a second become 30; --fps says another rate.")
-    name = pathlib.Path(str(motion)).stem if str(motion) not in CLIPS else str(motion)
+    out = f"{motion if str(motion) in CLIPS else pathlib.Path(motion).stem}.usdc"
     words = ["physxnet", "dress", shlex.quote(str(motion)), *options]
-    words += ["--wear", "top", "bottom", "-o", shlex.quote(f"{name}.usdc")]
+    words += ["--wear", "top", "bottom", "-o", shlex.quote(out)]
     return MotionInspection(
-        str(motion),
-        clip.num_frames,
-        clip.fps,
-        str(names["skeleton"]),
-        joints,
-        len(carried),
-        left_out,
-        str(names["reference"]),
-        names["unit"],
-        **measured,
-        problems=tuple(problems),
+        path=str(motion),
+        frames=clip.num_frames,
+        fps=clip.fps,
+        skeleton=found.family,
+        joints=found.joints,
+        carried=len(found.carried),
+        left_out=left_out,
+        reference=found.reference,
+        unit=found.unit,
+        travelled=course.travelled,
+        fastest=course.fastest,
+        feet=course.feet,
+        problems=tuple(course.problems),
         notes=tuple(notes),
         command=" ".join(words),
     )
 
 
-def _course(
-    body: Body, clip: Motion, steady: Motion, shape: Float[Array, " shapes"] | None
-) -> tuple[list[str], list[str], dict[str, float]]:
-    """What is wrong with where the person goes, and how far and fast."""
-    root = np.asarray(steady.root, np.float64)
-    steps = np.linalg.norm(np.diff(root, axis=0), axis=1)
-    ground = np.linalg.norm(np.diff(root, axis=0)[:, [0, 2]], axis=1)
-    fastest = float(steps.max(initial=0.0)) * steady.fps
-    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+class _Skeleton(NamedTuple):
+    """Whose joints a motion has, the body's that follow them, and those no map names."""
+
+    family: str
+    joints: int
+    carried: frozenset[str]
+    added: tuple[str, ...]
+    reference: str
+    unit: str | None
+
+
+def _skeleton(
+    read: SourceClip | Motion,
+    told: Mapping[str, str] | None,
+    body: Body,
+    rest: Float[Array, "all 3"],
+) -> _Skeleton:
+    if isinstance(read, Motion):
+        names = body.joint_names
+        return _Skeleton("built-in body", len(names), frozenset(names), (), "its rest pose", "m")
+    index = joint_index(read, body, told)
+    return _Skeleton(
+        find_joint_map(read)[0] if told is None else "own map",
+        len(read.names),
+        frozenset(index),
+        () if told is None else tuple(sorted(index.keys() - told.keys())),
+        _reference(read, index),
+        _unit(read, index, body, rest),
+    )
+
+
+class _Course(NamedTuple):
+    """What is wrong with where the person goes, what to know of it, and how far and fast."""
+
+    problems: list[str]
+    notes: list[str]
+    travelled: float
+    fastest: float
+    feet: float
+
+
+def _course(body: Body, clip: Motion, rest: Float[Array, "all 3"]) -> _Course:
+    steady = clip if clip.fps <= _RATE else resample(clip, _RATE)
+    steps = np.diff(np.asarray(steady.root, np.float64), axis=0)
+    speeds = np.linalg.norm(steps, axis=1) * steady.fps
+    fastest = float(speeds.max(initial=0.0))
     heights = foot_heights(body, steady, rest)
     feet, low = float(np.median(heights)), float(heights.min())
     problems, notes = [], []
@@ -184,7 +212,7 @@ def _course(
     if turns is not None:
         problems.append(turns.partition(": ")[2])
     if fastest > _FASTEST:
-        frame = int(steps.argmax() * clip.fps / steady.fps)
+        frame = int(speeds.argmax() * clip.fps / steady.fps)
         problems.append(
             f"its hips go at {fastest:.0f} m/s at frame {frame}: a jump in the capture, or a wrong"
             " rate (--source-fps says the true one)."
@@ -199,11 +227,8 @@ def _course(
         notes.append(f"a foot is {-100 * low:.0f} cm below the floor at frame {frame}.")
     if clip.num_frames < 2:
         notes.append("a single frame: a pose, not a motion.")
-    return (
-        problems,
-        notes,
-        {"travelled": float(ground.sum()), "fastest": fastest, "feet": feet},
-    )
+    travelled = float(np.linalg.norm(steps[:, [0, 2]], axis=1).sum())
+    return _Course(problems, notes, travelled, fastest, feet)
 
 
 def _reference(source: SourceClip, index: Mapping[str, int]) -> str:
@@ -221,10 +246,9 @@ def _unit(
     source: SourceClip,
     index: Mapping[str, int],
     body: Body,
-    shape: Float[Array, " shapes"] | None,
+    rest: Float[Array, "all 3"],
 ) -> str | None:
     """The unit in which the legs are about as long as the body's."""
-    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     heads = np.asarray(body.joint_positions(rest)[0], np.float64)
     metres = leg_length(heads, body.joint_names.index)
     length = leg_length(source.positions()[0], index.__getitem__)
