@@ -156,8 +156,10 @@ def test_layers_are_told_as_measured():
     measured = (ROOT / "experiments/results/layers.md").read_text()
     assert measured in (ROOT / "docs/garments.md").read_text()
     for row in measured.splitlines()[2:]:
-        outer, inner, kept_outer, kept_inner = (float(x) for x in row.split("|")[3:7])
-        assert kept_outer < 0.2 * outer and kept_inner < 0.2 * inner
+        outer, inner, *kept, own_outer, own_inner = (float(x) for x in row.split("|")[3:9])
+        assert kept[0] < 0.2 * outer and kept[1] < 0.2 * inner
+        # As README says.
+        assert max(kept) < 3.0 and own_outer < 1.0 and own_inner < 0.5
 
 
 def test_broken_files_are_refused_as_is_told():
@@ -167,6 +169,15 @@ def test_broken_files_are_refused_as_is_told():
     assert "(read)" not in made and made.count("\n") > 30
 
 
+def test_one_script_is_every_command_of_the_reproduction():
+    text = (ROOT / "docs/reproduction.md").read_text()
+    (block,) = re.findall(r"```\n(physxnet dataset build.*?)```", text, re.S)
+    script = (ROOT / "experiments/everything.sh").read_text()
+    assert script.endswith(block) and "set -euo pipefail" in script
+    for name in re.findall(r"^python (experiments/\w+\.py)", block, re.M):
+        assert (ROOT / name).is_file()
+
+
 def test_the_reproduction_shows_what_was_measured():
     """Tables and claims are made of the rows, and the shipped cards say the same."""
     text = (ROOT / "docs/reproduction.md").read_text()
@@ -174,11 +185,22 @@ def test_the_reproduction_shows_what_was_measured():
     rows = [ActionError(**r) for r in told]
     assert summary_table(rows).strip() in text
     assert error_tables(rows).strip() in text
-    for name in ("ablations", "unseen", "mirrored_answer", "cloth_memory", "previous_offset"):
+    for name in (
+        "ablations",
+        "unseen",
+        "mirrored_answer",
+        "cloth_memory",
+        "clip_start",
+        "previous_offset",
+    ):
         block = re.search(rf"<!-- begin {name} -->\n(.*?)<!-- end {name} -->", text, re.S)
         assert block and block.group(1) == (ROOT / f"experiments/results/{name}.md").read_text()
     made = runpy.run_path(str(ROOT / "experiments/reproduce.py"))
     assert made["claims"](rows) in text and made["dataset_table"]() in text
+    assert made["sizes_table"]() in text and made["bounds_table"](rows) in text
+    for name, table in (("more_motion", made["more_motion"]), ("paper_longer", summary_table)):
+        more = json.loads((ROOT / f"experiments/results/{name}.json").read_text())
+        assert table([ActionError(**r) for r in more]).strip() in text
     configs = ROOT / "experiments/configs"
     named = set(re.findall(r"experiments/configs/(\w+\.py)", text))
     assert named and all((configs / n).is_file() for n in named)

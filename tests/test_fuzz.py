@@ -21,7 +21,7 @@ import trimesh
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 from physxnet_jax.dressing import load_scene
-from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.io import (
     load_predictor,
     read_character,
@@ -43,6 +43,7 @@ PLY = (
     b"property float z\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
     b"0 0 0\n1 0 0\n0 1 0\n1 1 1\n3 0 1 2\n3 1 3 2\n"
 )
+MTL = "newmtl red\nKd 1 0 0\nd 0.5\nmap_Kd -s 1 1 1 red.png\n\nnewmtl blue\nKd 0 0 1\nNs 10\n"
 NAMES = 'Hips = "a"\nLeftLeg = "b"\n'
 
 
@@ -123,6 +124,13 @@ def _character(folder):
     return _npz(folder, positions=np.stack([x, x + 0.1]), faces=np.array([[0, 1, 2]]), fps=30.0)
 
 
+def _png(folder):
+    from PIL import Image
+
+    Image.new("RGB", (3, 2), (200, 10, 10)).save(folder / "good.png")
+    return (folder / "good.png").read_bytes()
+
+
 def _usda(folder):
     return b"""#usda 1.0
 (
@@ -157,6 +165,22 @@ def Mesh "shirt" (prepend apiSchemas = ["SkelBindingAPI"])
     uniform token[] xformOpOrder = ["xformOp:translate"]
 }
 """
+
+
+def _garment_usdc(folder):
+    """The same in USD's binary form."""
+    from pxr import Usd
+
+    (folder / "text.usda").write_bytes(_garment_usda(folder))
+    Usd.Stage.Open(str(folder / "text.usda")).Export(str(folder / "binary.usdc"))
+    return (folder / "binary.usdc").read_bytes()
+
+
+def _binary(document):
+    """A glTF's text as a GLB of one chunk."""
+    text = document + b" " * (-len(document) % 4)
+    head = b"glTF" + np.array([2, 20 + len(text), len(text)], "<u4").tobytes()
+    return head + b"JSON" + text
 
 
 def _exported(kind):
@@ -198,6 +222,25 @@ def _amc(path):
 def _asf(path):
     (path.parent / "a.amc").write_text(AMC)
     return read_amc(path.parent / "a.amc", path)
+
+
+def _materials(path):
+    """What an OBJ says of colours and pictures, in the file beside it."""
+    (path.parent / "a.obj").write_text(f"mtllib {path.name}\nusemtl red\n{OBJ}")
+    return read_obj(path.parent / "a.obj")
+
+
+def _picture(path):
+    """A damaged picture goes along as it is, or isn't one."""
+    _materials(path)
+    (path.parent / "a.mtl").write_text(f"newmtl red\nKd 1 0 0\nmap_Kd {path.name}\n")
+    mesh = (path.parent / "a.obj").read_text().replace(f"mtllib {path.name}", "mtllib a.mtl")
+    (path.parent / "a.obj").write_text(mesh)
+    (material,) = read_obj(path.parent / "a.obj").polygons.materials
+    blob = path.read_bytes()
+    assert material.texture.data in (blob, None)
+    if material.texture.data is None:
+        raise FormatError(f"{path}: no picture.")
 
 
 def _card(path):
@@ -247,6 +290,11 @@ READERS = {
     "skin": (_skin, ".gltf", read_character, 150),
     "garment skin": (_skin, ".gltf", read_mesh, 150),
     "garment usd": (_garment_usda, ".usda", read_mesh, 150),
+    "binary garment usd": (_garment_usdc, ".usdc", read_mesh, 40),
+    "glb": (lambda f: _binary(_gltf(f)), ".glb", load_motion, 150),
+    "garment glb": (lambda f: _binary(_skin(f)), ".glb", read_mesh, 150),
+    "materials": (lambda f: MTL.encode(), ".mtl", _materials, 100),
+    "picture": (_png, ".png", _picture, 60),
     "ply": (lambda f: PLY, ".ply", read_mesh, 150),
     "binary ply": (lambda f: _exported("ply"), ".ply", read_mesh, 150),
     "stl": (lambda f: _exported("stl"), ".stl", read_mesh, 150),
@@ -298,7 +346,9 @@ def tried(name: str, folder: pathlib.Path, blob: bytes) -> bool:
         return False
     finally:
         new = {p.name for p in folder.iterdir()} - before
-        assert new <= {"file.asf", "a.amc", "weights"}, "a reader has written something"
+        # What the readers above have put beside it.
+        beside = {"file.asf", "a.amc", "a.obj", "a.mtl", "weights"}
+        assert new <= beside, "a reader has written something"
     return True
 
 

@@ -268,3 +268,26 @@ def test_work_that_would_be_lost_is_told_of_before_it_is_done(capsys, tmp_path):
     # A start within the last frame is that frame.
     assert main([*words, "-o", str(tmp_path / "b.npz"), "--start", "3.99"]) == 0
     assert np.load(tmp_path / "b.npz")["bottom_positions"].shape[0] == 1
+
+
+def test_a_captured_dance_wears_a_file_from_elsewhere(data_dir, tmp_path, capsys):
+    """A BVH of a motion library and an OBJ of somebody's shirt, into a stage that others read."""
+    Usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdGeom
+
+    dance, shirt = data_dir / "mocap/daz/060_10.bvh", data_dir / "garments/tee.obj"
+    out = tmp_path / "salsa.usdc"
+    words = ["dress", dance, "--wear", shirt, "bottom", "--frames", "3", "-o", out]
+    assert main([str(w) for w in words]) == 0
+    assert "wrote" in capsys.readouterr().out
+    stage = Usd.Stage.Open(str(out))
+    found = {p.GetName(): UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)}
+    assert {"tee", "bottom"} <= set(found)
+    file = read_obj(shirt)
+    first, last = (
+        np.asarray(found["tee"].GetPointsAttr().Get(t)) for t in (0, stage.GetEndTimeCode())
+    )
+    assert first.shape == last.shape == np.shape(file.vertices)
+    assert np.isfinite(first).all() and np.abs(last - first).max() > 1e-3
+    height = np.ptp(first[:, 1])
+    assert 0.4 < height < 1.2, "in metres, on the dancer"

@@ -102,7 +102,7 @@ def test_a_clip_of_one_frame_is_somebody_who_stands_still(dresser, motion):
     assert np.isfinite(slope).all() and np.abs(slope).max() > 0
 
 
-@pytest.mark.parametrize("weights", ["nano", "small", "local+relax", "pair+mirror"])
+@pytest.mark.parametrize("weights", ["nano", "small", "local+relax", "pair+mirror", "paper"])
 def test_the_slope_by_the_pose_is_the_differences_at_every_rung(dresser, motion, weights):
     """And by the weights. The mean height of a leg that is bent, without push-out's corners."""
     person = make_dresser(["bottom"], weights=weights, push_out=False)

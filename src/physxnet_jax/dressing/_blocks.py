@@ -16,7 +16,7 @@ from ..geometry import each_frame
 from ..models import Predictor, Wearable, dress_frames, skin_wearable
 from ..motion import BLOCK, Motion, padded_block
 from ..simulation import ACCURACY, Scene, prepare_scene, simulate_batch, standard_effects
-from ._layers import Layer, inside_out, lift_layers
+from ._layers import Layer, inside_out, keep_layers_apart
 from ._push_out import SkinPatch, push_out, skin_height
 from ._stages import Stage
 
@@ -54,7 +54,7 @@ def dress_block(
         worn.append(x)
         inside.append(jnp.mean((height < 0).astype(x.dtype), axis=1))
     if pushed:
-        worn = lift_layers(layers, worn)
+        worn = keep_layers_apart(layers, worn)
     return tuple(zip(worn, inside, strict=True))
 
 
@@ -123,7 +123,7 @@ def lift_clip(
 
 @jax.jit
 def _lift_block(layers: tuple[Layer, ...], worn: tuple[Array, ...]) -> tuple[Array, ...]:
-    return tuple(lift_layers(layers, worn))
+    return tuple(keep_layers_apart(layers, worn))
 
 
 def simulate_clip(

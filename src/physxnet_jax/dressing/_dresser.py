@@ -26,7 +26,7 @@ from ..models import (
 from ..motion import poses_before
 from ..typing import pytree
 from ._dress import as_on, bound_wearable, fit_surface
-from ._layers import Layer, lift_layers, lift_off, make_layers
+from ._layers import Layer, keep_apart, keep_layers_apart, make_layers
 from ._meshes import worn_garments
 from ._push_out import SkinPatch, make_patch, push_out, tuck_in
 
@@ -44,7 +44,7 @@ class Dresser:
         predictor: The network, batch norm folded.
         wearables: What is worn.
         patches: The skin that each garment is pushed out of.
-        layers: Which garments lie over which, innermost first.
+        layers: Which garments are kept over or beneath which, innermost first.
         garments: The same at rest on the body's default shape, and what carries them.
         push_out: Whether vertices inside the body are moved out of it.
         notes: What the reader should know about the garments' files; no part of the
@@ -245,7 +245,7 @@ def clothe(
     raw = dress_frames(dresser.predictor, dresser.wearables, *led, fps)
     world, shift = (x[lead:] for x in led)
     if dresser.push_out:
-        raw = lift_layers(
+        raw = keep_layers_apart(
             dresser.layers,
             [
                 each_frame(functools.partial(push_out, patch), x, world, shift)
@@ -314,5 +314,5 @@ def clothe_frame(
     if dresser.push_out:
         worn = [push_out(p, x, world, shift) for x, p in zip(raw, dresser.patches, strict=True)]
         for layer in dresser.layers:
-            worn[layer.outer] = lift_off(layer, worn[layer.inner], worn[layer.outer])
+            worn[layer.moved] = keep_apart(layer, worn[layer.still], worn[layer.moved])
     return stream, _clothed({w.name: x for w, x in zip(dresser.wearables, worn, strict=True)})

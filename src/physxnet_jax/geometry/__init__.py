@@ -14,6 +14,7 @@ from ._frames import each_frame as each_frame
 from ._intersect import self_intersections as self_intersections
 from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
 from ._normals import face_normals as face_normals, vertex_normals as vertex_normals
+from ._padding import padded_rows as padded_rows
 from ._polygons import (
     Material as Material,
     Polygons as Polygons,

@@ -14,7 +14,7 @@ from scipy.spatial import KDTree
 from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..errors import MeshError
 from ..garment import carried_weights, smoothing_matrix
-from ..geometry import TriMesh, closest_among, nearby_faces, vertex_normals
+from ..geometry import TriMesh, closest_among, nearby_faces, padded_rows, vertex_normals
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
 # How much better a garment that stands on the floor fits there than about the origin [1].
@@ -197,12 +197,13 @@ def nearest_skin(
         faces: Its triangles.
     """
     near = nearby_faces(np.asarray(skin.vertices), np.asarray(skin.faces), vertices, neighbours=12)
-    points = jnp.asarray(vertices.astype(np.float32))
-    hit = jax.jit(closest_among)(skin, points, jnp.asarray(near))
+    points = padded_rows(vertices.astype(np.float32))
+    hit = jax.jit(closest_among)(skin, jnp.asarray(points), jnp.asarray(padded_rows(near)))
     refs = skin.faces[hit.face]
-    weights = np.asarray(carried_weights(body.weights, refs, hit.weights))
-    weights = _smooth_far(weights, faces, np.sqrt(np.asarray(hit.squared_distance)))
-    return refs, hit.weights, weights
+    carried = carried_weights(body.weights, refs, hit.weights)
+    known = (refs, hit.weights, carried, hit.squared_distance)
+    refs, shares, weights, squared = (np.asarray(x)[: len(vertices)] for x in known)
+    return jnp.asarray(refs), jnp.asarray(shares), _smooth_far(weights, faces, np.sqrt(squared))
 
 
 def _smooth_far(weights: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from ..errors import FormatError, MissingDependencyError
 from ..geometry import Material, Polygons, make_material
 from ._moving import Moving
 from ._texture import texture_beside
+from ._usd_trial import try_stage
 
 # Coordinates and frames that are read at most.
 _MOST, _FRAMES = 3e8, 20_000
@@ -71,6 +72,7 @@ def _damage_told(path: pathlib.Path) -> Iterator[None]:
 def _opened(path: pathlib.Path) -> Any:
     from pxr import Usd
 
+    try_stage(path)
     stage = Usd.Stage.Open(str(path))
     folder = path.parent.resolve()
     for layer in stage.GetUsedLayers():

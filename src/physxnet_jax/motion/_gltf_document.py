@@ -1,6 +1,7 @@
 """A glTF file's document: read if it is one, refused if it can't be used."""
 
 import pathlib
+import warnings
 from typing import Any
 
 from ..errors import MissingDependencyError, MotionError
@@ -32,7 +33,10 @@ def parse_gltf(path: pathlib.Path) -> Any:
     binary = path.read_bytes()[:4] == b"glTF"
     try:
         loader = pygltflib.GLTF2()
-        document: Any = (loader.load_binary if binary else loader.load_json)(str(path))
+        # It warns of what is refused below.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)
+            document: Any = (loader.load_binary if binary else loader.load_json)(str(path))
         version = str(document.asset.version)
     # The library fails in as many ways as a file can be broken.
     except Exception as error:

@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body
 from ..garment import Garment, Template
-from ..geometry import TriMesh, cast_rays, closest_points, vertex_normals
+from ..geometry import TriMesh, cast_rays, closest_points, padded_rows, vertex_normals
 from ..typing import pytree
 from ._atlas import Atlas
 from ._dress_body import dress_body
@@ -128,8 +128,11 @@ def bind(
         PhysXNet, equation 9: T_XB.
     """
     mesh = chart_mesh(atlas, body, rest, garment.template)
-    points = garment.mesh.vertices
-    normals = vertex_normals(points, garment.mesh.faces)
+    normals = vertex_normals(garment.mesh.vertices, garment.mesh.faces)
+    count = len(normals)
+    points, normals = (
+        jnp.asarray(padded_rows(np.asarray(x))) for x in (garment.mesh.vertices, normals)
+    )
     hits = cast_rays(mesh, points, normals, both=True, max_distance=_REACH[garment.template])
     near = closest_points(mesh, points)
     # On the host from here: nothing to compile.
@@ -137,6 +140,7 @@ def bind(
     good = reach <= _STRAY * np.sqrt(np.asarray(near.squared_distance)) + 0.01
     face = np.where(good, np.asarray(hits.face), np.asarray(near.face))
     weights = np.where(good[:, None], np.asarray(hits.weights), np.asarray(near.weights))
+    good, face, weights = good[:count], face[:count], weights[:count]
     uv = np.einsum("vk,vkc->vc", weights, np.asarray(mesh.uv)[np.asarray(mesh.uv_faces)[face]])
     texel, weight, off = sampling_weights(atlas, uv, np.asarray(valid), mesh, face, weights)
     return Binding(
