@@ -1,6 +1,8 @@
 """Networks: the fast transposed convolution, shapes, features and their invariances."""
 
 import dataclasses
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -488,3 +490,45 @@ def test_a_dress_by_the_paper_begins_and_ends_on_joined_legs(body, rest):
     gap = np.linalg.norm(again - np.asarray(g.mesh.vertices), axis=1)
     skirt = np.asarray(g.mesh.vertices)[:, 1] < -0.15
     assert np.median(gap[skirt]) < 0.025
+
+
+UNOPTIMISED = """
+import os
+os.environ["XLA_FLAGS"] = "--xla_backend_optimization_level=0"
+import jax
+import jax.numpy as jnp
+import numpy as np
+from physxnet_jax.body import load_body
+from physxnet_jax.io import load_predictor
+from physxnet_jax.models import clip_features, normalise
+from physxnet_jax.motion import load_motion
+
+body, walk = load_body(), load_motion("walk", fps=30.0)
+rest = body.rest_vertices(body.default_shape())
+network = load_predictor("nano")
+inputs = network.config.inputs
+turn, shift = (
+    jnp.repeat(x[None], inputs.window, axis=0)
+    for x in body.transforms(rest, walk.rotations[0], walk.root[0])
+)
+
+@jax.jit
+@jax.grad
+def slope(turn):
+    seen = clip_features(
+        network.surface.rest, network.surface.weights, turn, shift, 30.0, inputs
+    )
+    return jnp.sum(normalise(seen, network.normalisation, inputs) ** 2)
+
+found = slope(turn)
+print("finite" if bool(jnp.isfinite(found).all()) else "spoiled", float(jnp.abs(found).max()))
+"""
+
+
+def test_slopes_are_finite_however_a_compiler_rounds():
+    """Unoptimised programs compute values anew, and the maximum among them is none of them."""
+    done = subprocess.run(
+        [sys.executable, "-c", UNOPTIMISED], capture_output=True, text=True, timeout=300
+    )
+    word, most = done.stdout.split()
+    assert word == "finite" and float(most) > 0, done.stdout + done.stderr[-2000:]

@@ -187,6 +187,8 @@ def least_index(values: Float[Array, "rows columns"], *, axis: int = 1) -> Int[A
     the last index is given.
     """
     index = jax.lax.broadcasted_iota(jnp.int32, values.shape, axis)
+    # Computed once: rounded anew beside its minimum a value would be equal to none.
+    values = jax.lax.optimization_barrier(values)
     least = jnp.min(values, axis=axis, keepdims=True)
     return jnp.min(jnp.where(values <= least, index, values.shape[axis] - 1), axis=axis)
 

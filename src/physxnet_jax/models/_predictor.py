@@ -275,8 +275,9 @@ def normalise(
 
 def _shortened(values: Float[Array, "*batch channels"]) -> Float[Array, "*batch channels"]:
     vectors = values.reshape(*values.shape[:-1], -1, 3)
-    # Scaled first: the square of a huge number must not overflow.
-    largest = jnp.max(jnp.abs(vectors), axis=-1, keepdims=True)
+    # Scaled first: the square of a huge number must not overflow. The scale cancels, so its
+    # derivative isn't wanted; that of a maximum is 0/0 where a compiler rounds the values anew.
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(vectors), axis=-1, keepdims=True))
     far = largest > _FARTHEST
     shrunk = vectors / jnp.where(far, largest, jnp.ones_like(largest))
     squared = jnp.sum(shrunk * shrunk, axis=-1, keepdims=True)

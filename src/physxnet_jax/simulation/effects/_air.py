@@ -136,7 +136,8 @@ class _Lee:
         """How deep in the lee each vertex is, 0 to 1, shape [vertices, 1, batch]."""
         way = np.asarray(wind) / np.linalg.norm(wind)
         gap = placed.points[self.near] - base[:, None]
-        squared = jnp.sum(gap * gap, axis=2)
+        # Computed once: the derivative of a minimum looks for what is equal to it.
+        squared = jax.lax.optimization_barrier(jnp.sum(gap * gap, axis=2))
         facing = jnp.sum(placed.normals * jnp.asarray(way, base.dtype)[None, :, None], axis=1)
         least = jnp.min(squared, axis=1, keepdims=True)
         # The normals of all that are about as near: one would make seams where it changes.
