@@ -169,10 +169,13 @@ def test_broken_files_are_refused_as_is_told():
     assert "(read)" not in made and made.count("\n") > 30
 
 
-def test_one_script_is_every_command_of_the_reproduction():
-    text = (ROOT / "docs/reproduction.md").read_text()
-    (block,) = re.findall(r"```\n(physxnet dataset build.*?)```", text, re.S)
-    script = (ROOT / "experiments/everything.sh").read_text()
+@pytest.mark.parametrize(
+    ("page", "script"), [("reproduction", "everything"), ("accuracy-cost", "accuracy_cost")]
+)
+def test_one_script_is_every_command_of_a_page(page, script):
+    text = (ROOT / f"docs/{page}.md").read_text()
+    block = re.findall(r"```\n(physxnet .*?)```", text, re.S)[0]
+    script = (ROOT / f"experiments/{script}.sh").read_text()
     assert script.endswith(block) and "set -euo pipefail" in script
     for name in re.findall(r"^python (experiments/\w+\.py)", block, re.M):
         assert (ROOT / name).is_file()

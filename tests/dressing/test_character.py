@@ -96,15 +96,18 @@ def test_what_is_moved_off_his_skin_stays_beneath_what_is_over_it(character, mon
     crossing = dress(character, ["dress", "top"], method="lbs", frames=2)
     monkeypatch.undo()
     apart = dress(character, ["dress", "top"], method="lbs", frames=2)
-    (layer,) = known
+    layer, press = known
+    assert (press.still, press.moved) == (layer.moved, layer.still)
 
     def beneath(clip):
         worn = [jnp.asarray(g.positions) for g in clip.garments]
         height = jax.vmap(lambda a, b: layer_height(layer, a, b)[0])
-        return float((height(worn[layer.inner], worn[layer.outer]) < 0.0).mean())
+        return float((height(worn[layer.still], worn[layer.moved]) < 0.0).mean())
 
-    assert beneath(apart) < 0.5 * beneath(crossing) and beneath(apart) < 0.02
-    np.testing.assert_array_equal(crossing.garments[0].positions, apart.garments[0].positions)
+    assert beneath(apart) < 0.6 * beneath(crossing) and beneath(apart) < 0.02
+    # What is beneath gives way where it came through, by little.
+    pressed = np.linalg.norm(crossing.garments[0].positions - apart.garments[0].positions, axis=-1)
+    assert 0.0 < (pressed > 0.0).mean() < 0.5 and np.quantile(pressed, 0.99) < 0.01
     assert apart.inside["top"] < 0.04
 
 
