@@ -115,8 +115,9 @@ def test_costs_are_the_measured_ones():
         assert block and block.group(1) == (ROOT / f"experiments/results/{name}.md").read_text()
     rows = json.loads((ROOT / "experiments/results/accuracy_cost.json").read_text())["rows"]
     named = {r["size"] for r in rows if r["method"].startswith("network")}
-    words = re.search(r"physxnet (bench net.*)", text).group(1).split()
-    assert named == set(words[words.index("--weights") + 1 : words.index("--garments")])
+    commands = (ROOT / "experiments/accuracy_cost.sh").read_text()
+    asked = re.findall(r"--weights (.*?) --garments", commands)
+    assert named == {name for names in asked for name in names.split()}
     assert {n.partition("+")[0] for n in named} <= set(list_weights())
 
 
