@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # Every dataset, network and number of docs/reproduction.md, which lists the same commands.
 # With the environment of `make` on the path (PATH=.venv/bin:$PATH), motion files at hand
-# (PHYSXNET_DATA) and Blender (PHYSXNET_BLENDER). Each command goes on where it was stopped.
+# (PHYSXNET_DATA) and Blender (PHYSXNET_BLENDER). Most commands go on where they were stopped.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 physxnet dataset build experiments/configs/dataset_physxnet.py --out runs/ours

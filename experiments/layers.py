@@ -7,8 +7,8 @@ Result:  experiments/results/layers.md, shown in docs/garments.md: on 32 frames 
          share of the outer garment's vertices beneath the inner one, and of the inner one's
          above the outer one, with each pushed out of the body alone and with the layers kept
          apart; how much of the latter is in its own place: where both were within 3 cm of each
-         other at rest. The remainder is a sleeve's cloth in the side's. Milliseconds a frame
-         of both, in turns.
+         other at rest. The remainder is another limb's cloth. Milliseconds a frame of both, in
+         turns.
 """
 
 import argparse

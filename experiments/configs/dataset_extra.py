@@ -1,7 +1,7 @@
 """The 16 actions beyond the protocol, through our own simulator: more to learn from.
 
 Command: physxnet dataset build experiments/configs/dataset_extra.py --out runs/extra
-Cost:    11 minutes of two cores: 645 s of simulation.
+Cost:    645 s of simulation.
 Result:  2,597 frames; no result of the paper's protocol uses them unless it says so.
 """
 

@@ -1,7 +1,7 @@
 """The protocol's 34 actions through our own simulator.
 
 Command: physxnet dataset build experiments/configs/dataset_physxnet.py --out runs/ours
-Cost:    11 minutes of two cores (653 s of simulation), 28 on a slower machine; 86 MB.
+Cost:    653 s of simulation, 1,654 s on a slower machine; 86 MB.
 Result:  the set that the shipped weights learned from; sizes and checksums are in
          docs/reproduction.md.
 """

@@ -7,18 +7,10 @@ Result:  best on its validation action after 2,280 steps, worse from there on; o
          actions experiments/results/paper_longer.json, beside `paper`.
 """
 
-from physxnet_jax.models import PAPER, ModelConfig
-from physxnet_jax.training import TrainConfig
+import dataclasses
+import pathlib
+import runpy
 
-CONFIG = TrainConfig(
-    model=ModelConfig(PAPER, resolution=64, width=16),
-    epochs=25,
-    batch=8,
-    learning_rate=1e-3,
-    schedule="cosine",
-    adversarial=True,
-    validation=("kick ball",),
-    validate_every=380,
-    patience=12,
-    checkpoint_every=380,
-)
+_PAPER = runpy.run_path(str(pathlib.Path(__file__).with_name("paper_cpu.py")))["CONFIG"]
+
+CONFIG = dataclasses.replace(_PAPER, epochs=25)

@@ -69,6 +69,18 @@ def test_what_takes_too_much_or_too_long_is_refused(binary, monkeypatch):
     np.testing.assert_array_equal(read_mesh(binary).faces, [[0, 1, 2]])
 
 
+def test_where_no_python_can_be_started_it_is_read_at_once(binary, monkeypatch):
+    def forbidden(*words, **more):
+        raise PermissionError
+
+    with monkeypatch.context() as m:
+        m.setattr(_usd_trial.subprocess, "run", forbidden)
+        assert len(read_mesh(binary).vertices) == 3
+        m.setattr(_usd_trial.sys, "executable", "/opt/studio/bin/studio")
+        m.setattr(_usd_trial.subprocess, "run", None)
+        assert len(read_mesh(binary).vertices) == 3
+
+
 def test_text_is_read_at_once_but_not_what_it_refers_to(binary, monkeypatch):
     started = []
     real = _usd_trial.subprocess.run

@@ -60,6 +60,21 @@ def test_a_map_of_the_garments_own_offsets_gives_the_garment_back(bound, body):
     assert np.median(error) < 0.005
 
 
+def test_a_garment_of_fewer_vertices_shares_the_programs_and_binds_alike(bound, body, rest):
+    atlas, g, rows, binding = bound
+    before = closest_points._cache_size()
+    # A face's last vertex goes; the others stay where they are.
+    faces = np.asarray(g.mesh.faces)
+    kept = faces[(faces < g.num_vertices - 1).all(axis=1)]
+    mesh = g.mesh.replace(vertices=g.mesh.vertices[:-1], faces=jnp.asarray(kept))
+    less = bind(atlas, body, rest, dataclasses.replace(g, mesh=mesh), rows.valid)
+    assert closest_points._cache_size() == before
+    assert len(less.texel) == g.num_vertices - 1
+    # Normals, and so rays, differ beside what is gone alone.
+    same = (np.asarray(less.texel) == np.asarray(binding.texel)[:-1]).all(axis=1)
+    assert same.mean() > 0.99
+
+
 def test_an_upside_down_garment_falls_back_but_stays_finite(body, rest):
     atlas = make_atlas(32)
     g = template("bottom")

@@ -38,17 +38,19 @@ def try_stage(path: pathlib.Path) -> None:
 
     Text that refers to no other file is left to the reader, which stops where it ends.
 
+    Where no Python can be started (embedded, or forbidden) nothing is tried.
+
     Raises:
-        FormatError: It can't be read within these bounds.
+        FormatError: It takes too long for its size.
+        ValueError: It can't be read in as much memory, or at all.
     """
+    if not pathlib.Path(sys.executable or "").name.startswith("python"):
+        return
     with path.open("rb") as file:
         if file.read(5) == b"#usda" and b"@" not in file.read():
             return
     beside = {path, *path.parent.glob("*.usd*"), *path.parent.glob("*/*.usd*")}
-    size = sum(p.stat().st_size for p in beside)
-    # Where Python is embedded there is none to start.
-    if not sys.executable:
-        return
+    size = sum(p.stat().st_size for p in beside if p.is_file())
     words = [sys.executable, "-P", "-c", _TRIAL, str(path), str(_BASE + _PER_BYTE * size)]
     try:
         done = subprocess.run(
@@ -61,5 +63,7 @@ def try_stage(path: pathlib.Path) -> None:
         raise FormatError(
             f"{path}: its size doesn't account for the time it takes to read. Export it again."
         ) from None
+    except OSError:
+        return
     if done.returncode:
-        raise FormatError(f"{path}: not a USD stage, or a damaged one. Export it again.")
+        raise ValueError(f"{path}: damaged.")
