@@ -123,6 +123,7 @@ def main() -> None:
         "clip_start",
         "previous_offset",
         "accuracy_cost",
+        "precision",
         "frames_seen",
         "relaxation",
         "relaxed_cost",

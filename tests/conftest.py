@@ -12,7 +12,7 @@ import jax  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-from physxnet_jax._environment import programs_folder  # noqa: E402
+from physxnet_jax._environment import free_programs, programs_folder  # noqa: E402
 
 # Many tests compile the same programs, in several processes, and every run does again:
 # once is enough on a machine.
@@ -42,9 +42,7 @@ def pytest_configure(config):
 def _free_compiled_code():
     """Each compiled function holds memory maps, of which a process has 65,530."""
     yield
-    maps = pathlib.Path("/proc/self/maps")
-    if not maps.exists() or maps.read_bytes().count(b"\n") > 30_000:
-        jax.clear_caches()
+    free_programs(0.45)
 
 
 @pytest.fixture(scope="session")

@@ -6,9 +6,11 @@ import subprocess
 import sys
 import threading
 
+import jax
+import jax.numpy as jnp
 import pytest
 
-from physxnet_jax._environment import cache_folder, keep_programs, keeps_programs
+from physxnet_jax._environment import cache_folder, free_programs, keep_programs, keeps_programs
 from physxnet_jax.files import whole_file
 
 
@@ -32,6 +34,34 @@ def test_processors_have_folders_of_their_own(monkeypatch):
         keep_programs(env)
         seen.add(env["JAX_COMPILATION_CACHE_DIR"])
     assert len(seen) == 2
+
+
+def test_programs_are_forgotten_before_maps_run_out(monkeypatch, tmp_path):
+    freed = []
+    monkeypatch.setattr(jax, "clear_caches", lambda: freed.append(True))
+    most, held = tmp_path / "most", tmp_path / "held"
+    monkeypatch.setattr("physxnet_jax._environment._MAPS_ALLOWED", most)
+    monkeypatch.setattr("physxnet_jax._environment._MAPS_HELD", held)
+    assert not free_programs(), "a system that doesn't say has no bound"
+    most.write_text("100\n")
+    held.write_text("map\n" * 59)
+    assert not free_programs() and not freed
+    held.write_text("map\n" * 60)
+    assert free_programs() and len(freed) == 1
+    assert not free_programs(0.7)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="maps are counted by Linux")
+def test_forgotten_programs_give_their_maps_back():
+    def held() -> int:
+        return pathlib.Path("/proc/self/maps").read_bytes().count(b"\n")
+
+    start = held()
+    for k in range(40):
+        jax.jit(lambda x, k=k: jnp.cumsum(jnp.sin(x) * k) @ x)(jnp.ones(8 + k))
+    full = held()
+    assert full > start + 40
+    assert free_programs(0.0) and held() < (start + full) / 2
 
 
 @pytest.fixture

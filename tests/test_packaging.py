@@ -20,7 +20,7 @@ EXTRAS = {
     "render": ("pyvista", "from physxnet_jax.viewer import check_preview; check_preview('a.png')"),
     "mesh": (
         "fast_simplification",
-        "from physxnet_jax.garment._repair import decimate;"
+        "from physxnet_jax.garment._decimate import decimate;"
         " from physxnet_jax.garment import template; decimate(template('bottom').mesh, 0.05)",
     ),
     "export": (

@@ -13,6 +13,8 @@ BROKEN_JAXLIB = {
     "0.10.2": "computes wrong numbers on CPU (jax-ml/jax#39103)",
     "0.11.0": "is suspected of the same fault (jax-ml/jax#39257)",
 }
+_MAPS_ALLOWED = pathlib.Path("/proc/sys/vm/max_map_count")
+_MAPS_HELD = pathlib.Path("/proc/self/maps")
 _FLAG = "xla_cpu_experimental_ynn_fusion_type="
 
 
@@ -86,6 +88,33 @@ def keep_programs(environment: MutableMapping[str, str] | None = None) -> None:
     # Loading from the cache, XLA takes its own hints for missing instructions and says so
     # as an error (jax-ml/jax#38445).
     env.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
+
+
+def free_programs(share: float = 0.6) -> bool:
+    """Forgets what was compiled before it takes all memory maps that a process may have.
+
+    Every compiled function holds some; where there are none left the compiler ends the
+    process, however much memory is free. Where maps aren't bounded (all systems but Linux)
+    nothing is done.
+
+    Args:
+        share: Of all maps, from which on programs are forgotten.
+
+    Returns:
+        Whether they were.
+    """
+    try:
+        most = int(_MAPS_ALLOWED.read_text())
+        with _MAPS_HELD.open("rb") as lines:
+            held = sum(1 for _ in lines)
+    except (OSError, ValueError):
+        return False
+    if held < share * most:
+        return False
+    import jax
+
+    jax.clear_caches()
+    return True
 
 
 def processor_name() -> str:

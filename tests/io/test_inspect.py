@@ -389,7 +389,7 @@ def test_real_garments_were_made_for_the_rest_pose(data_dir):
 
 
 def test_edges_are_as_short_as_asked_for_whatever_lifting_does(tmp_path):
-    coarse = decimate(template("top").mesh, 0.07)
+    coarse, _ = decimate(template("top").mesh, 0.07)
     path = saved(tmp_path, "a.obj", np.asarray(coarse.vertices), np.asarray(coarse.faces))
     assert "--edge-length 20" in inspect_garment(path).command
     _, after = fit_garment(path, tmp_path / "b.obj", edge_length=0.02)

@@ -136,12 +136,23 @@ def test_a_fitted_garment_keeps_them(quilted, tmp_path):
     assert np.mean(finer.material == nearest) > 0.9
 
 
-def test_a_decimated_garment_says_that_materials_are_lost(quilted, tmp_path):
+def test_a_decimated_garment_keeps_materials_and_texture(quilted, tmp_path):
     pytest.importorskip("fast_simplification")
+    done, _ = fit_garment(quilted, tmp_path / "fitted.obj")
     done, _ = fit_garment(quilted, tmp_path / "coarse.obj", coarser=0.03)
-    assert any(d.startswith("materials are lost") for d in done)
-    p = read_obj(tmp_path / "coarse.obj").polygons
-    assert p is not None and p.materials == ()
+    assert "polygons are triangles now." in done
+    whole, mesh = read_obj(tmp_path / "fitted.obj"), read_obj(tmp_path / "coarse.obj")
+    before, p = whole.polygons, mesh.polygons
+    assert before is not None and p is not None and p.materials == before.materials
+    assert len(mesh.faces) < 0.8 * len(whole.faces)
+    middle, fine = (m.vertices[m.faces].mean(axis=1) for m in (mesh, whole))
+    nearest = before.material[before.of_triangle][KDTree(fine).query(middle)[1]]
+    assert np.mean(p.material == nearest) > 0.9 and len(set(p.material)) > 1
+    assert mesh.uv is not None and whole.uv is not None
+    assert mesh.uv_faces is not None and whole.uv_faces is not None
+    old, new = whole.uv[whole.uv_faces].mean(axis=1), mesh.uv[mesh.uv_faces].mean(axis=1)
+    gap = np.linalg.norm(new - old[KDTree(fine).query(middle)[1]], axis=1)
+    assert np.median(gap) < 0.02 * np.ptp(whole.uv, axis=0).max()
 
 
 def test_a_fitted_garment_keeps_them_welded_and_turned_round(quilted, tmp_path):

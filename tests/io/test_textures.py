@@ -258,12 +258,113 @@ def test_gltf_images_are_found_however_they_are_kept(painted, tmp_path):
     def second(document):
         document.materials[0].pbrMetallicRoughness.baseColorTexture.texCoord = 1
 
-    def moved(document):
-        told = document.materials[1].pbrMetallicRoughness.baseColorTexture
-        told.extensions = {"KHR_texture_transform": {"scale": [2, 2]}}
+    assert changed("f.glb", second) == [None, BLUE], "there is no second set"
 
-    assert changed("f.glb", second) == [None, BLUE]
-    assert changed("g.glb", moved) == [RED, None]
+
+def seen_at(mesh, material, of):
+    """Mean of coordinates over the corners of a material, and what a file had there."""
+    p, q = mesh.polygons, of.polygons
+    rows, told = (x.uv_corners[np.repeat(x.material, x.counts) == material] for x in (p, q))
+    triangles = mesh.uv_faces[p.material[p.of_triangle] == material]
+    assert set(triangles.ravel()) == set(rows), "triangles look where polygons do"
+    return mesh.uv[rows], of.uv[told]
+
+
+# The quarter turns of implementations: (u, v) of glTF, v downwards, is looked up at (v, -u).
+MOVES = {
+    "scaled": ({"scale": [2, 3]}, lambda u, v: (2 * u, 3 * v)),
+    "moved": ({"offset": [0.25, 0.5]}, lambda u, v: (u + 0.25, v + 0.5)),
+    "turned": ({"rotation": np.pi / 2}, lambda u, v: (v, -u)),
+    "all": (
+        {"scale": [2, 3], "offset": [0.25, 0.5], "rotation": np.pi / 2},
+        lambda u, v: (3 * v + 0.25, -2 * u + 0.5),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MOVES)
+def test_gltf_coordinates_that_a_material_moves(painted, tmp_path, name):
+    pygltflib = pytest.importorskip("pygltflib")
+    write_clip(tmp_path / "a.glb", [worn(painted)], 30.0)
+    told, where = MOVES[name]
+    document = pygltflib.GLTF2().load_binary(str(tmp_path / "a.glb"))
+    texture = document.materials[1].pbrMetallicRoughness.baseColorTexture
+    texture.extensions = {"KHR_texture_transform": told}
+    document.save_binary(str(tmp_path / "b.glb"))
+    before, after = read_mesh(tmp_path / "a.glb"), read_mesh(tmp_path / "b.glb")
+    assert images(after) == [RED, BLUE]
+    for material in (0, 1):
+        seen, (u, v) = (x.T for x in seen_at(after, material, before))
+        # Here v is upwards.
+        a, b = where(u, 1 - v) if material else (u, 1 - v)
+        np.testing.assert_allclose(seen, [a, 1 - b], atol=1e-5)
+
+
+def test_gltf_coordinates_of_a_second_set(painted, tmp_path):
+    pygltflib = pytest.importorskip("pygltflib")
+    write_clip(tmp_path / "a.glb", [worn(painted)], 30.0)
+    document = pygltflib.GLTF2().load_binary(str(tmp_path / "a.glb"))
+    document.materials[0].pbrMetallicRoughness.baseColorTexture.texCoord = 1
+    for primitive in document.meshes[0].primitives:
+        primitive.attributes.TEXCOORD_1 = primitive.attributes.TEXCOORD_0
+    document.save_binary(str(tmp_path / "b.glb"))
+    assert images(read_mesh(tmp_path / "b.glb")) == [RED, BLUE]
+
+
+def test_obj_coordinates_that_a_material_moves(painted, tmp_path):
+    before = read_obj(painted)
+    library = painted.with_name("looks.mtl")
+    text = library.read_text()
+    library.write_text(text.replace("-s 1 1 1", "-s 2 3 1 -o 0.25 0.5"))
+    after = read_obj(painted)
+    assert images(after) == [RED, BLUE]
+    for material in (0, 1):
+        seen, was = seen_at(after, material, before)
+        wanted = was * [2, 3] + [0.25, 0.5] if material == 0 else was
+        np.testing.assert_allclose(seen, wanted, atol=1e-6)
+    # Written again they need no options.
+    write_clip(tmp_path / "a.obj", [worn(painted)], 30.0)
+    assert "-s" not in next(tmp_path.glob("*.mtl")).read_text()
+    for broken in ("-s nan 1", "-s 1e300 1", "-o inf inf"):
+        library.write_text(text.replace("-s 1 1 1", broken))
+        np.testing.assert_array_equal(read_obj(painted).uv, before.uv)
+
+
+def test_usd_coordinates_that_a_material_moves(painted, tmp_path):
+    pytest.importorskip("pxr")
+    from pxr import Gf, Sdf, Usd, UsdShade
+
+    write_clip(tmp_path / "a.usda", [worn(painted)], 30.0)
+    before = read_mesh(tmp_path / "a.usda")
+    stage = Usd.Stage.Open(str(tmp_path / "a.usda"))
+    (image, *_) = (
+        s
+        for prim in stage.Traverse()
+        if (s := UsdShade.Shader(prim)) and s.GetIdAttr().Get() == "UsdUVTexture"
+    )
+    st = image.GetInput("st")
+    source = UsdShade.ConnectableAPI.GetConnectedSource(st)[0]
+    move = UsdShade.Shader.Define(stage, image.GetPrim().GetParent().GetPath().AppendChild("move"))
+    move.CreateIdAttr("UsdTransform2d")
+    move.CreateInput("in", Sdf.ValueTypeNames.Float2).ConnectToSource(
+        UsdShade.Shader(source.GetPrim()).ConnectableAPI(), "result"
+    )
+    move.CreateInput("scale", Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(2, 3))
+    move.CreateInput("rotation", Sdf.ValueTypeNames.Float).Set(90.0)
+    move.CreateInput("translation", Sdf.ValueTypeNames.Float2).Set(Gf.Vec2f(0.25, 0.5))
+    move.CreateOutput("result", Sdf.ValueTypeNames.Float2)
+    st.ConnectToSource(move.ConnectableAPI(), "result")
+    stage.GetRootLayer().Export(str(tmp_path / "b.usda"))
+    for image_file in tmp_path.glob("a_*.*g"):
+        image_file.with_name(image_file.name.replace("a_", "b_", 1)).write_bytes(
+            image_file.read_bytes()
+        )
+    after = read_mesh(tmp_path / "b.usda")
+    assert images(after) == [RED, BLUE]
+    for material in (0, 1):
+        seen, (u, v) = (x.T for x in seen_at(after, material, before))
+        wanted = (0.25 - 3 * v, 0.5 + 2 * u) if material == 0 else (u, v)
+        np.testing.assert_allclose(seen, wanted, atol=1e-5)
 
 
 def test_usd_files_of_other_programs(painted, tmp_path):

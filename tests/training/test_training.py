@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import json
+import math
 
 import jax
 import jax.numpy as jnp
@@ -364,6 +365,24 @@ def test_a_discriminator_that_wins_or_guesses_raises_the_alarm():
     assert Players().update({"l1": 1.0}) == {}
 
 
+@pytest.mark.parametrize(
+    ("loss", "value", "alarm"),
+    [
+        ("discriminator", 2 * math.log(2), 0.0),  # it says that it doesn't know
+        ("discriminator", 2.0, 1.0),
+        ("adversarial", -math.log(0.185), 0.0),  # it knows, and is as unsure as its labels
+        ("adversarial", -math.log(0.04), 1.0),
+        ("adversarial", math.nan, 1.0),
+    ],
+)
+def test_either_players_loss_raises_the_alarm_whatever_the_accuracy(loss, value, alarm):
+    players = Players()
+    for _ in range(100):
+        usual = {"discriminator_accuracy": 0.75, "discriminator": 1.2, "adversarial": 1.0}
+        seen = players.update({**usual, loss: value})
+    assert seen["gan_alarm"] == alarm
+
+
 def test_bfloat16_learns_nearly_as_fast(tmp_path):
     last = {}
     for precision in ("float32", "bfloat16"):
@@ -422,12 +441,13 @@ def test_the_mean_of_the_accuracy_goes_on_where_it_was():
     rng = np.random.default_rng(0)
     noted = []
     for step in range(60):
-        seen = {"discriminator_accuracy": float(rng.uniform())}
+        seen = {"discriminator_accuracy": float(rng.uniform()), "adversarial": float(step)}
         want = whole.update(seen)
         if step < 40:
             noted.append({"step": float(step), **first.update(seen)})
             # What was written after the last checkpoint is done again.
-            rest = Players([*noted, {"step": 99.0, "discriminator_accuracy_mean": 0.0}], step)
+            late = {"step": 99.0, "discriminator_accuracy_mean": 0.0, "adversarial_mean": 0.0}
+            rest = Players([*noted, late], step)
         else:
             got = rest.update(seen)
     assert got == want

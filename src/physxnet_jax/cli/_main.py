@@ -18,18 +18,17 @@ from ._commands import (
     Demo,
     Doctor,
     Dress,
-    Effects,
     Export,
     Fit,
     Inspect,
     Rest,
-    Simulate,
     View,
 )
 from ._doctor import doctor
 from ._experiment_commands import Bench, Dataset, Evaluate, Stress, Train
 from ._progress import UNWRITTEN, print_json, progress_bars
 from ._shape import parse_shape
+from ._simulation_commands import Effects, Simulate
 
 _COMMANDS: dict[str, type] = {
     "dress": Dress,

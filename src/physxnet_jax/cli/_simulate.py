@@ -26,8 +26,8 @@ from ..simulation import (
     simulate_batch,
 )
 from ..viewer import check_preview, render_preview
-from ._commands import Effects, Simulate
 from ._progress import UNWRITTEN, print_json, progress_bars
+from ._simulation_commands import Effects, Simulate
 
 
 def simulate(command: Simulate, console: Console) -> int:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._environment import free_programs
 from ..body import Body, load_body
 from ..errors import PhysXNetError
 from ..garment import Garment
@@ -138,6 +139,8 @@ def dress(
         if start:
             raise PhysXNetError("A character begins where its file does: leave out start.")
         motion, body, fps = person.motion, person.body, person.fps
+    # Who dresses a folder of garments compiles for each of them.
+    free_programs()
     stages: list[Stage] = []
     watch = Watch(stages)
     body = load_body() if body is None else body

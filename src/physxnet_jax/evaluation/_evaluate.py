@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._environment import free_programs
 from ..body import load_body
 from ..data import Sequence
 from ..garment import Template, template
@@ -186,6 +187,7 @@ class _Reference:
         assembly, to_cloth = self.tables(name)
         motion = sequence.motion
         reference = skinning()(motion, name).positions + sequence.offsets[name]
+        free_programs()
         answer = method(motion, name)
         finite = np.asarray(np.isfinite(answer.positions).all(axis=(1, 2)))
         shown = np.where(finite[:, None, None], answer.positions, 0.0)

@@ -1,5 +1,6 @@
 """Garments: templates, fitting and materials. Knows nothing of simulation."""
 
+from ._decimate import decimate as decimate
 from ._fit import (
     clearance as clearance,
     lift_out as lift_out,
@@ -18,7 +19,6 @@ from ._garment import (
 from ._repair import (
     MeshHealth as MeshHealth,
     clean as clean,
-    decimate as decimate,
     mesh_health as mesh_health,
     orient as orient,
     polygons_left as polygons_left,

@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components as components
 from scipy.spatial import KDTree
 
-from ..errors import MeshError, MissingDependencyError
+from ..errors import MeshError
 from ..geometry import (
     Polygons,
     TriMesh,
@@ -246,29 +246,6 @@ def polygons_left(
         return None
     moved = polygons.chosen(keep).at(row)
     return None if moved is None else moved.reversed(turned)
-
-
-def decimate(mesh: TriMesh, edge: float) -> TriMesh:
-    """About as few faces as equilateral ones of an edge length [m] would be.
-
-    Texture coordinates are dropped.
-
-    Raises:
-        MissingDependencyError: Without fast-simplification.
-    """
-    x, faces = _arrays(mesh)
-    area = float(_areas(x, faces).sum())
-    wanted = max(int(area / (np.sqrt(3.0) / 4.0 * edge**2)), 4)
-    if wanted >= len(faces):
-        return mesh
-    try:
-        import fast_simplification
-    except ImportError as error:
-        raise MissingDependencyError(
-            "Decimating needs fast-simplification: pip install 'physxnet-jax[mesh]'."
-        ) from error
-    found = fast_simplification.simplify(x, faces, target_count=wanted)
-    return make_mesh(found[0], found[1])
 
 
 def _arrays(

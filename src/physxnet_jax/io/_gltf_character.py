@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import FormatError, PhysXNetError
-from ..geometry import Polygons, Texture, make_material, make_texture
+from ..geometry import Polygons, make_material, make_texture
 from ..motion import GltfFile, Motion, drive
+from ._chart import make_move
 from ._moving import Moving, welded
 
 _TRIANGLES = 4
@@ -152,13 +153,57 @@ def _primitive(
         if weights.shape[1] != len(targets):
             raise FormatError(f"{file.path}: {len(targets)} morph targets of '{name}' don't fit.")
         positions = x + np.einsum("ft,tvc->fvc", weights.astype(np.float32), offsets)
-    uv = None
-    if attributes.TEXCOORD_0 is not None:
-        uv = np.asarray(file.accessor(attributes.TEXCOORD_0), float)
-        # Images begin at the top in glTF.
-        uv = uv * [1.0, -1.0] + [0.0, 1.0] if uv.shape == (len(x), 2) else None
+    uv = _chart(file, primitive, len(x))
     drawn = _polygons(file, primitive, faces, textured=uv is not None)
     return Moving(name, positions, faces, uv, None if uv is None else faces, polygons=drawn)
+
+
+def _chart(file: GltfFile, primitive: Any, count: int) -> Float[np.ndarray, "vertices 2"] | None:
+    """Coordinates by which the material's image is looked up, or the first there are."""
+    image = _base_image(file, primitive)
+    move = {} if image is None else _move(image)
+    told = _asked(primitive, image)
+    told = primitive.attributes.TEXCOORD_0 if told is None else told
+    if told is None:
+        return None
+    uv = np.asarray(file.accessor(told), float)
+    if uv.shape != (count, 2):
+        return None
+    # Implementations agree that it turns from v to u, other than the sample code
+    # (KhronosGroup/glTF#1563).
+    moved = make_move(
+        move.get("scale", (1.0, 1.0)), move.get("offset", (0.0, 0.0)), -_number(move, "rotation")
+    )
+    if moved is not None:
+        uv = uv @ moved[:, :2].T + moved[:, 2]
+    # Images begin at the top in glTF.
+    return uv * [1.0, -1.0] + [0.0, 1.0]
+
+
+def _asked(primitive: Any, image: Any) -> int | None:
+    """The set of coordinates that an image is looked up by; None if it isn't there."""
+    which = 0 if image is None else _move(image).get("texCoord", image.texCoord) or 0
+    return getattr(primitive.attributes, f"TEXCOORD_{which}", None)
+
+
+def _move(image: Any) -> dict[str, Any]:
+    told = (image.extensions or {}).get("KHR_texture_transform")
+    return told if isinstance(told, dict) else {}
+
+
+def _number(told: Mapping[str, Any], name: str) -> float:
+    value = told.get(name, 0.0)
+    return float(value) if isinstance(value, int | float) else 0.0
+
+
+def _base_image(file: GltfFile, primitive: Any) -> Any:
+    if primitive.material is None:
+        return None
+    told = file.document.materials[
+        file.index(primitive.material, file.document.materials, "material")
+    ]
+    plain = told.pbrMetallicRoughness
+    return None if plain is None else plain.baseColorTexture
 
 
 def _polygons(
@@ -172,12 +217,15 @@ def _polygons(
         plain = told.pbrMetallicRoughness
         rgba = None if plain is None else plain.baseColorFactor
         name = str(told.name or f"material{which}")
-        image = None if plain is None else plain.baseColorTexture
+        image = _base_image(file, primitive)
+        texture = None if image is None else make_texture(*file.image(image.index))
+        if texture is not None and _asked(primitive, image) is None:
+            texture = make_texture(texture.name, None)
         materials = (
             make_material(
                 name,
                 [1.0, 1.0, 1.0] if rgba is None else rgba[:3],
-                None if image is None else _texture(file, image),
+                texture,
             ),
         )
     corners = faces.reshape(-1)
@@ -188,13 +236,6 @@ def _polygons(
         np.full(count, len(materials) - 1, np.int32),
         materials,
     )
-
-
-def _texture(file: GltfFile, told: Any) -> Texture:
-    """The image of a material; named alone where it asks for other coordinates than are read."""
-    name, data = file.image(told.index)
-    moved = (told.extensions or {}).get("KHR_texture_transform")
-    return make_texture(name, None if told.texCoord or moved else data)
 
 
 def _check_size(file: GltfFile, frames: int, vertices: int) -> None:

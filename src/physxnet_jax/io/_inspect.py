@@ -275,7 +275,7 @@ def _tell_images(found: _Found, raw: StillMesh) -> None:
     if lost:
         found.notes.append(
             f"images that won't be put on it: {', '.join(lost)[:200]}. PNG or JPEG in the file's"
-            " folder are, by the first set of texture coordinates."
+            " folder are."
         )
     elif images and raw.uv is None:
         found.notes.append("its images won't be put on it: faces without texture coordinates.")

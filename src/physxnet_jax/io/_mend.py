@@ -54,8 +54,7 @@ def fit_garment(
         out: The ``.obj`` to write: metres, Y up, on the body at rest.
         like: Turn, scale and move it onto this template's place instead of guessing its unit.
         edge_length: Split edges longer than this [m].
-        coarser: Before that, decimate to about this edge length [m]; texture coordinates
-            are lost.
+        coarser: Before that, decimate to about this edge length [m].
         draped: At last let it down onto the body, by `drape`.
         body: The body; the built-in one by default.
         progress: Called by `drape`.
@@ -100,16 +99,13 @@ def fit_garment(
     count = int(np.sum(np.any(np.asarray(turned.faces) != np.asarray(mesh.faces), axis=1)))
     if count:
         done.append(f"turned {count:,} faces round.")
-    mesh, cut, decimated = turned, np.asarray(turned.faces), False
+    mesh, cut, origin = turned, np.asarray(turned.faces), np.arange(len(turned.faces))
     drawn = None if raw.polygons is None else polygons_left(raw.polygons, v, mesh)
     count = int(mesh.faces.shape[0])
     if coarser is not None:
-        textured = mesh.uv is not None
-        mesh = decimate(mesh, coarser)
-        decimated = int(mesh.faces.shape[0]) < count
-        if decimated:
-            lost = ", without its texture coordinates" if textured else ""
-            done.append(f"decimated {count:,} faces to {mesh.faces.shape[0]:,}{lost}.")
+        mesh, origin = decimate(mesh, coarser)
+        if len(origin) < count:
+            done.append(f"decimated {count:,} faces to {len(origin):,}.")
     count = int(mesh.faces.shape[0])
     mesh, low, part_of = _split_and_lifted(mesh, skin, edge_length)
     moved = np.asarray(mesh.vertices)
@@ -125,13 +121,9 @@ def fit_garment(
         far = np.linalg.norm(lain - moved, axis=1)
         done.append(f"let it down: it moved by {1e3 * float(np.median(far)):.0f} mm.")
         moved, _ = lift_out(skin, lain, np.asarray(mesh.faces), _LIFT * NEAREST, iterations=12)
-    # Joining triangles knows nothing of materials, splitting them nothing of polygons.
-    if drawn is not None and decimated:
-        if drawn.materials:
-            done.append("materials are lost: faces that were joined may have had several.")
-        drawn = None
-    elif drawn is not None and len(mesh.faces) != len(cut):
-        drawn = _triangles(drawn, part_of, mesh)
+    # Joining and splitting triangles know nothing of polygons.
+    if drawn is not None and not np.array_equal(origin[part_of], np.arange(len(cut))):
+        drawn = _triangles(drawn, origin[part_of], mesh)
         if raw.count < len(raw.faces):
             done.append("polygons are triangles now.")
     _write(out, mesh.replace(vertices=moved), drawn)
@@ -162,7 +154,7 @@ def _split_and_lifted(
 
 
 def _triangles(drawn: Polygons, part_of: Int[np.ndarray, " faces"], mesh: TriMesh) -> Polygons:
-    """The faces of a mesh that was split, each of the material of what it is a part of."""
+    """The faces of a mesh that was split or joined, each of the material of what it was."""
     return Polygons(
         np.full(len(mesh.faces), 3, np.int32),
         np.asarray(mesh.faces).reshape(-1),

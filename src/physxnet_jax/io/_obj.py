@@ -3,6 +3,7 @@
 import contextlib
 import pathlib
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,6 +11,7 @@ from jaxtyping import Float, Int
 from ..errors import FormatError
 from ..files import whole_file
 from ..geometry import Material, Polygons, Texture, make_material
+from ._chart import make_move, moved_charts
 from ._clip import StillMesh
 from ._texture import texture_beside, write_textures
 
@@ -106,22 +108,22 @@ def read_obj(path: str | pathlib.Path, part: str | None = None) -> StillMesh:
     corners = [c for p in polygons for c in _split(p, v)]
     table = np.asarray(corners)
     has_uv = bool(uv) and bool((table[..., 1] >= 0).all())
-    return StillMesh(
-        v,
-        table[..., 0],
-        np.asarray(uv) if has_uv else None,
-        table[..., 1] if has_uv else None,
-        _drawn(polygons, material, names, _colours(path, libraries), textured=has_uv),
-        len(polygons),
-        parts,
-    )
+    looks = _looks(path, libraries)
+    drawn = _drawn(polygons, material, names, looks, textured=has_uv)
+    chart, chart_faces = (np.asarray(uv), table[..., 1]) if has_uv else (None, None)
+    if chart is not None and chart_faces is not None:
+        moves = {k: looks[n].move for n, k in names.items() if n in looks}
+        chart, chart_faces, drawn = moved_charts(
+            chart, chart_faces, drawn, {k: m for k, m in moves.items() if m is not None}
+        )
+    return StillMesh(v, table[..., 0], chart, chart_faces, drawn, len(polygons), parts)
 
 
 def _drawn(
     polygons: list[list[tuple[int, int]]],
     material: list[int],
     names: dict[str, int],
-    colours: dict[str, Material],
+    looks: dict[str, "_Look"],
     *,
     textured: bool,
 ) -> Polygons:
@@ -131,53 +133,64 @@ def _drawn(
         corners[:, 0],
         corners[:, 1] if textured else None,
         np.asarray(material, np.int32),
-        tuple(colours.get(name, Material(name)) for name in names),
+        tuple(looks[n].material if n in looks else Material(n) for n in names),
     )
 
 
-def _colours(path: pathlib.Path, libraries: list[str]) -> dict[str, Material]:
+class _Look(NamedTuple):
+    """A material, and how it moves texture coordinates."""
+
+    material: Material
+    move: Float[np.ndarray, "2 3"] | None
+
+
+def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
     """Materials of the material files beside a mesh; what can't be read tells nothing."""
-    found: dict[str, Material] = {}
+    found: dict[str, _Look] = {}
     for library in libraries:
         # Only what lies beside it: a name may lead anywhere.
         file = path.parent / pathlib.PurePath(library.replace("\\", "/")).name
         if not file.is_file() or file.stat().st_size > _MAX_LIBRARY:
             continue
-        name, colour, image = None, None, None
+        name, colour, image, move = None, None, None, None
         for line in file.read_bytes().decode("utf-8", "replace").splitlines():
             words = line.split("#")[0].split()
             if words[:1] == ["newmtl"]:
-                name, colour, image = _rest(line), None, None
+                name, colour, image, move = _rest(line), None, None, None
             elif words[:1] == ["Kd"]:
                 with contextlib.suppress(ValueError):
                     colour = [float(w) for w in words[1:4]]
             elif words[:1] == ["map_Kd"] and words[1:]:
-                image = _image(file, line)
+                image, move = _image(file, line)
             if name is not None:
                 # Beside an image most programs write a grey that none of them multiplies by.
                 plain = image is None or image.data is None
-                found[name] = make_material(name, colour if plain else None, image)
+                material = make_material(name, colour if plain else None, image)
+                found[name] = _Look(material, None if plain else move)
     return found
 
 
-def _image(file: pathlib.Path, line: str) -> Texture:
-    """What `map_Kd` names, behind its options; names may have spaces."""
+def _image(file: pathlib.Path, line: str) -> tuple[Texture, Float[np.ndarray, "2 3"] | None]:
+    """What `map_Kd` names, and how its options move coordinates; names may have spaces."""
     rest = _rest(line)
+    told = {"s": [1.0, 1.0], "o": [0.0, 0.0]}
     while rest.startswith("-"):
         option, *words = rest.split()
         key = option[1:].lower()
         skipped = _OPTIONS.get(key, 0)
-        for word in words[: _NUMBERS.get(key, 0)]:
+        for k, word in enumerate(words[: _NUMBERS.get(key, 0)]):
             try:
-                float(word)
+                value = float(word)
             except ValueError:
                 break
             skipped += 1
+            if key in told and k < 2:
+                told[key][k] = value
         left = rest.split(None, 1 + skipped)
         if len(left) <= 1 + skipped:
             break
         rest = left[-1]
-    return texture_beside(file, rest)
+    return texture_beside(file, rest), make_move(told["s"], told["o"])
 
 
 def _rest(line: str) -> str:

@@ -11,10 +11,12 @@ from jaxtyping import Float
 
 from ..errors import FormatError, MissingDependencyError
 from ..geometry import Material, Polygons, make_material
+from ._chart import make_move, moved_charts
 from ._moving import Moving
 from ._texture import texture_beside
 from ._usd_trial import try_stage
 
+_Move = Float[np.ndarray, "2 3"]
 # Coordinates and frames that are read at most.
 _MOST, _FRAMES = 3e8, 20_000
 
@@ -149,10 +151,12 @@ def _meshes(
             mirrored = mirrored or (k == 0 and np.linalg.det(world[:3, :3]) < 0)
             x[k] = unit * (local @ world[:3, :3] + world[3, :3])
         uv, rows = _chart(prim, np.asarray(corners))
-        drawn = (
-            _polygons(path, prim, np.asarray(counts), np.asarray(corners), rows) if bound else None
-        )
+        drawn, moves = None, {}
+        if bound:
+            drawn, moves = _polygons(path, prim, np.asarray(counts), np.asarray(corners), rows)
         uv_faces = None if rows is None else rows[slots]
+        if drawn is not None and uv is not None and uv_faces is not None:
+            uv, uv_faces, drawn = moved_charts(uv, uv_faces, drawn, moves)
         part = Moving(prim.GetName(), x, faces, uv, uv_faces, polygons=drawn)
         parts.append(part.reversed() if mirrored else part)
     return parts
@@ -160,11 +164,15 @@ def _meshes(
 
 def _polygons(
     path: pathlib.Path, prim: Any, counts: np.ndarray, corners: np.ndarray, rows: np.ndarray | None
-) -> Polygons:
-    """Faces of a prim, outwards, with the materials that it or its subsets are bound to."""
+) -> tuple[Polygons, dict[int, _Move]]:
+    """Faces of a prim, outwards, with the materials that it or its subsets are bound to.
+
+    And how those materials that do so move texture coordinates, by number.
+    """
     from pxr import UsdGeom, UsdShade
 
-    found: dict[Material, int] = {}
+    found: list[tuple[Material, bytes]] = []
+    moves: dict[int, _Move] = {}
 
     def number(at: Any) -> int:
         bound = UsdShade.MaterialBindingAPI(at).ComputeBoundMaterial()[0]
@@ -173,29 +181,31 @@ def _polygons(
         surface = bound.ComputeSurfaceSource()[0]
         told = surface.GetInput("diffuseColor") if surface else None
         image = _image(told) if told else None
-        colour = told.Get() if told else None
+        colour, move = told.Get() if told else None, None
         if image is not None:
-            colour, image = image[0], texture_beside(path, image[1])
+            colour, image, move = image[0], texture_beside(path, image[1]), image[2]
         material = make_material(bound.GetPrim().GetName(), colour, image)
-        return found.setdefault(material, len(found))
+        key = material, b"" if move is None else move.tobytes()
+        if key not in found:
+            found.append(key)
+            if move is not None:
+                moves[len(found) - 1] = move
+        return found.index(key)
 
     which = np.full(len(counts), number(prim), np.int32)
     for subset in UsdShade.MaterialBindingAPI(prim).GetMaterialBindSubsets():
         chosen = np.asarray(subset.GetIndicesAttr().Get() or (), np.int64)
         which[chosen[(chosen >= 0) & (chosen < len(which))]] = number(subset.GetPrim())
     drawn = Polygons(
-        counts.astype(np.int32), corners.astype(np.int32), rows, which, tuple(found)
+        counts.astype(np.int32), corners.astype(np.int32), rows, which, tuple(m for m, _ in found)
     ).chosen(np.flatnonzero(counts > 2))
     turned = UsdGeom.Mesh(prim).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
-    return drawn.reversed(np.arange(len(drawn.counts))) if turned else drawn
+    return drawn.reversed(np.arange(len(drawn.counts))) if turned else drawn, moves
 
 
-def _image(told: Any) -> tuple[object, str] | None:
-    """Tint and file of the image that an input is connected to; None for anything else."""
-    from pxr import UsdShade
-
-    source, *_ = UsdShade.ConnectableAPI.GetConnectedSource(told) or (None,)
-    shader = UsdShade.Shader(source.GetPrim()) if source else None
+def _image(told: Any) -> tuple[object, str, _Move | None] | None:
+    """Tint, file and move of the image that an input is connected to; None for anything else."""
+    shader = _connected(told)
     file = shader.GetInput("file") if shader else None
     asset = file.Get() if file else None
     # An image for each tile (UDIM) is none of one name.
@@ -203,7 +213,27 @@ def _image(told: Any) -> tuple[object, str] | None:
         return None
     tint = shader.GetInput("scale")
     scale = tint.Get() if tint else None
-    return (1.0, 1.0, 1.0) if scale is None else [*scale][:3], asset.path
+    where = _connected(shader.GetInput("st"))
+    move = None
+    if where and where.GetIdAttr().Get() == "UsdTransform2d":
+        scaled, moved, turned = (
+            i.Get() if (i := where.GetInput(name)) else None
+            for name in ("scale", "translation", "rotation")
+        )
+        move = make_move(
+            (1.0, 1.0) if scaled is None else scaled,
+            (0.0, 0.0) if moved is None else moved,
+            np.radians(0.0 if turned is None else turned),
+        )
+    return (1.0, 1.0, 1.0) if scale is None else [*scale][:3], asset.path, move
+
+
+def _connected(told: Any) -> Any:
+    """The shader that an input is connected to, or None."""
+    from pxr import UsdShade
+
+    source, *_ = (told and UsdShade.ConnectableAPI.GetConnectedSource(told)) or (None,)
+    return UsdShade.Shader(source.GetPrim()) if source else None
 
 
 def _chart(prim: Any, vertices: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:

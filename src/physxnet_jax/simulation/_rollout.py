@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from .._environment import free_programs
 from ..body import Body
 from ..errors import SimulationError
 from ..motion import Motion, animate
@@ -142,6 +143,7 @@ def simulate_batch(
     """
     if not motions:
         raise SimulationError("No motion to simulate; give at least one.")
+    free_programs()
     solver = ACCURACY["standard"].at_rate(motions[0].fps) if solver is None else solver
     # Only around what is traced and run: the rest of the process keeps its precision.
     with jax.enable_x64(solver.precision == "float64"):

@@ -14,8 +14,14 @@ METRICS = "metrics.jsonl"
 _BEATEN = 0.97
 # One this near to guessing has lost itself, or the generator is perfect.
 _GUESSING = 0.52
-# Weight of the newest measurement in the running mean.
+# Its loss where it knows nothing and says so is 2 log 2: above this it diverges.
+_THROWN = 1.6
+# The generator's, -log D, is 1.7 where a discriminator knows all and is as unsure as its noisy
+# labels: above this (D below 0.05) it is surer than they are, and its gradient is gone.
+_HOPELESS = 3.0
+# Weight of the newest measurement in the running means.
 _NEWEST = 0.05
+_WATCHED = ("discriminator_accuracy", "discriminator", "adversarial")
 
 
 def read_metrics(folder: str | pathlib.Path) -> list[dict[str, Any]]:
@@ -72,26 +78,32 @@ class Players:
     """
 
     def __init__(self, noted: Sequence[Mapping[str, float]] = (), done: int = 0) -> None:
-        means = [
-            line["discriminator_accuracy_mean"]
-            for line in noted
-            if "discriminator_accuracy_mean" in line and line["step"] <= done
-        ]
-        self._accuracy: float | None = means[-1] if means else None
+        self._means: dict[str, float] = {}
+        for line in noted:
+            if line["step"] <= done:
+                self._means |= {k: line[f"{k}_mean"] for k in _WATCHED if f"{k}_mean" in line}
 
     def update(self, metrics: Mapping[str, float]) -> dict[str, float]:
-        """Running mean of the discriminator's accuracy, and its alarm.
+        """Running means of the discriminator's accuracy and of both losses, and an alarm.
 
         ``gan_alarm`` is 1 where the discriminator is nearly always right (its gradient
-        is gone) or as good as guessing (it has collapsed), else 0.
+        is gone) or as good as guessing (it has collapsed), where its loss is worse than
+        guessing's, where the generator's says that nothing it makes ever passes, or where
+        one of them isn't a number; else 0.
         """
-        new = metrics.get("discriminator_accuracy")
-        if new is None:
+        if "discriminator_accuracy" not in metrics:
             return {}
-        old = self._accuracy
-        self._accuracy = new if old is None else (1 - _NEWEST) * old + _NEWEST * new
-        wrong = self._accuracy > _BEATEN or self._accuracy < _GUESSING
-        return {"discriminator_accuracy_mean": self._accuracy, "gan_alarm": float(wrong)}
+        for k in _WATCHED:
+            if k in metrics:
+                old = self._means.get(k, metrics[k])
+                self._means[k] = (1 - _NEWEST) * old + _NEWEST * metrics[k]
+        accuracy = self._means["discriminator_accuracy"]
+        fine = (
+            _GUESSING <= accuracy <= _BEATEN
+            and self._means.get("discriminator", 0.0) <= _THROWN
+            and self._means.get("adversarial", 0.0) <= _HOPELESS
+        )
+        return {**{f"{k}_mean": v for k, v in self._means.items()}, "gan_alarm": float(not fine)}
 
 
 class Board:

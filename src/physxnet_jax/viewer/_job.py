@@ -11,6 +11,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._environment import free_programs
 from ..body import load_body
 from ..dressing import (
     animated_meshes,
@@ -159,6 +160,8 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
         PhysXNetError: Anything that can't be read, bound or worn; the text says why.
     """
     check_choice(choice)
+    # A page may be open for days.
+    free_programs()
     body = load_body()
     shape = _shape(choice)
     clip = wanted_clip(
