@@ -194,6 +194,8 @@ def test_an_engine_is_timed_and_drawn_without_an_error():
     rows += [row("network", "local", 1, 9.0, params=99), row("lbs", "-", 1, 20.0)]
     placed = [r.size for r in sorted(rows, key=_place)]
     assert placed == ["-", "blender", "blender", "blender", "small", "local"]
+    solved = [row("simulator", a, 1, 9.0) for a in ("standard", "fine", "noise", "draft")]
+    assert [r.size for r in sorted(solved, key=_place)] == ["noise", "draft", "standard", "fine"]
 
 
 def test_a_row_timed_again_has_the_errors_of_its_garments():

@@ -29,6 +29,7 @@ from ..garment import TEMPLATES, Template
 from ..io import load_predictor
 from ..models import at_precision
 from ..motion import load_motion
+from ..simulation import ACCURACY
 from ..viewer import draw_work_precision
 from ._experiment_commands import Bench
 from ._machine import machine
@@ -115,7 +116,9 @@ def _place(row: Cost) -> tuple[object, ...]:
     """Where a row stands in the table, whichever was measured first."""
     kind = row.method.partition("+")[0]
     place = ("lbs", "simulator", "engine", "network").index(kind)
-    return place, row.params, row.size, row.precision, row.method, row.garments, row.batch
+    # From the coarsest on, as a line through them goes.
+    finer = [*ACCURACY].index(row.size) if row.size in ACCURACY else -1
+    return place, row.params, finer, row.size, row.precision, row.method, row.garments, row.batch
 
 
 def _measure(

@@ -1,7 +1,6 @@
 """A mesh of fewer faces that looks like the finer one: its texture and its materials."""
 
 import numpy as np
-import trimesh
 from jaxtyping import Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components as components
@@ -31,8 +30,10 @@ def decimate(mesh: TriMesh, edge: float) -> tuple[TriMesh, Int[np.ndarray, " few
     Raises:
         MissingDependencyError: Without fast-simplification.
     """
+    from trimesh import triangles
+
     x, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
-    area = float(trimesh.triangles.area(x[faces]).sum())
+    area = float(triangles.area(x[faces]).sum())
     wanted = max(int(area / (np.sqrt(3.0) / 4.0 * edge**2)), 4)
     if wanted >= len(faces):
         return mesh, np.arange(len(faces))
@@ -57,12 +58,14 @@ def _origins(
     fine: Float[np.ndarray, "faces 3 3"], coarse: Float[np.ndarray, "fewer 3 3"]
 ) -> Int[np.ndarray, " fewer"]:
     """The fine face nearest to the middle of each coarse one, of those that face its way."""
+    from trimesh import triangles
+
     middle = coarse.mean(axis=1)
     near = min(_NEAR, len(fine))
     _, found = KDTree(fine.mean(axis=1)).query(middle, k=near)
     found = np.asarray(found).reshape(len(coarse), near)
     flat = found.reshape(-1)
-    onto = trimesh.triangles.closest_point(fine[flat], np.repeat(middle, near, axis=0))
+    onto = triangles.closest_point(fine[flat], np.repeat(middle, near, axis=0))
     far = np.linalg.norm(onto.reshape(len(coarse), near, 3) - middle[:, None], axis=2)
     along = np.einsum("fni,fi->fn", _normals(fine)[found], _normals(coarse))
     # Where none faces its way the nearest has to do.
@@ -86,6 +89,8 @@ def _texture(
     A sleeve's texture may meet itself at a seam: what lies on the other side of it is in the
     same piece, but not joined to the origin within the reach of one face.
     """
+    from trimesh import triangles
+
     edges = mesh_edges(chart)
     a, b = edges.faces[edges.count == 2].astype(np.int64).T
     joined = coo_matrix((np.ones(len(a), np.int8), (a, b)), (len(fine), len(fine))).tocsr()
@@ -101,9 +106,9 @@ def _texture(
         near = near[part == part[np.searchsorted(near, origin[f])]]
         rows = np.tile(near, 3)
         point = np.repeat(coarse[f], len(near), axis=0)
-        onto = trimesh.triangles.closest_point(fine[rows], point)
+        onto = triangles.closest_point(fine[rows], point)
         best = np.linalg.norm(onto - point, axis=1).reshape(3, -1).argmin(axis=1)
         pick = best + len(near) * np.arange(3)
-        share = trimesh.triangles.points_to_barycentric(fine[rows[pick]], onto[pick])
+        share = triangles.points_to_barycentric(fine[rows[pick]], onto[pick])
         out[f] = np.einsum("ck,cki->ci", share, fine_uv[rows[pick]])
     return out
