@@ -36,5 +36,5 @@ python experiments/mirrored_answer.py
 python experiments/cloth_memory.py
 python experiments/clip_start.py
 python experiments/unseen.py
-python experiments/reproduce.py --data runs/blender --methods lbs local local+push standard
+python experiments/reproduce.py --data runs/blender --methods lbs local local+push pair+mirror paper paper+push standard
 python experiments/reproduce.py --data runs/ours
