@@ -262,7 +262,7 @@ def test_gltf_images_are_found_however_they_are_kept(painted, tmp_path):
 
 
 def seen_at(mesh, material, of):
-    """Mean of coordinates over the corners of a material, and what a file had there."""
+    """Coordinates at the corners of a material, and what another file has there."""
     p, q = mesh.polygons, of.polygons
     rows, told = (x.uv_corners[np.repeat(x.material, x.counts) == material] for x in (p, q))
     triangles = mesh.uv_faces[p.material[p.of_triangle] == material]

@@ -70,7 +70,7 @@ def bench_net(command: Bench, console: Console) -> int:
             else:
                 for some in _missing(command, known) if kind == "network" or not known else ():
                     rows += list(_measure(kind, size, precision, some, tests, known_errors))
-            # Compiled programs hold memory maps, of which a process has 65,530.
+            # Every method compiles for itself; kept, programs would take all memory maps.
             jax.clear_caches()
             rows.sort(key=_place)
             if command.out is not None:

@@ -9,13 +9,14 @@ from jaxtyping import Float, Int
 
 from ..geometry import Polygons
 
+Move = Float[np.ndarray, "2 3"]
+"""Takes (u, v, 1) to the coordinates that an image is looked up by."""
+
 _MOST = 1e6
 
 
-def make_move(
-    scale: Any = (1.0, 1.0), offset: Any = (0.0, 0.0), turned: Any = 0.0
-) -> Float[np.ndarray, "2 3"] | None:
-    """What takes (u, v, 1) to the coordinates that an image is looked up by.
+def make_move(scale: Any = (1.0, 1.0), offset: Any = (0.0, 0.0), turned: Any = 0.0) -> Move | None:
+    """The move of a scale, a turn and an offset.
 
     Args:
         scale: Of u and v, first of all; whatever a file says.
@@ -36,11 +37,16 @@ def make_move(
     return None if same or not (np.abs(move) < _MOST).all() else move
 
 
+def moved(uv: Float[np.ndarray, "uvs 2"], move: Move) -> Float[np.ndarray, "uvs 2"]:
+    """Texture coordinates after a move."""
+    return uv @ move[:, :2].T + move[:, 2]
+
+
 def moved_charts(
     uv: Float[np.ndarray, "uvs 2"],
     uv_faces: Int[np.ndarray, "faces 3"],
     polygons: Polygons,
-    moves: Mapping[int, Float[np.ndarray, "2 3"]],
+    moves: Mapping[int, Move],
 ) -> tuple[Float[np.ndarray, "more 2"], Int[np.ndarray, "faces 3"], Polygons]:
     """Coordinates as images are looked up by, so that no material needs to move them.
 
@@ -68,6 +74,6 @@ def moved_charts(
         corners[here] = number[corners[here]]
         there = of_face == material
         uv_faces[there] = number[uv_faces[there]]
-        rows.append(uv[used] @ move[:, :2].T + move[:, 2])
+        rows.append(moved(uv[used], move))
         count += len(used)
     return np.concatenate(rows), uv_faces, dataclasses.replace(polygons, uv_corners=corners)

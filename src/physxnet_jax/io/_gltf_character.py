@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from ..errors import FormatError, PhysXNetError
 from ..geometry import Polygons, make_material, make_texture
 from ..motion import GltfFile, Motion, drive
-from ._chart import make_move
+from ._chart import make_move, moved
 from ._moving import Moving, welded
 
 _TRIANGLES = 4
@@ -160,8 +160,7 @@ def _primitive(
 
 def _chart(file: GltfFile, primitive: Any, count: int) -> Float[np.ndarray, "vertices 2"] | None:
     """Coordinates by which the material's image is looked up, or the first there are."""
-    image = _base_image(file, primitive)
-    move = {} if image is None else _move(image)
+    image = _image(_material(file, primitive))
     told = _asked(primitive, image)
     told = primitive.attributes.TEXCOORD_0 if told is None else told
     if told is None:
@@ -169,65 +168,58 @@ def _chart(file: GltfFile, primitive: Any, count: int) -> Float[np.ndarray, "ver
     uv = np.asarray(file.accessor(told), float)
     if uv.shape != (count, 2):
         return None
+    told = {} if image is None else _transform(image)
+    turned = told.get("rotation", 0.0)
     # Implementations agree that it turns from v to u, other than the sample code
     # (KhronosGroup/glTF#1563).
-    moved = make_move(
-        move.get("scale", (1.0, 1.0)), move.get("offset", (0.0, 0.0)), -_number(move, "rotation")
+    move = make_move(
+        told.get("scale", (1.0, 1.0)),
+        told.get("offset", (0.0, 0.0)),
+        -turned if isinstance(turned, int | float) else 0.0,
     )
-    if moved is not None:
-        uv = uv @ moved[:, :2].T + moved[:, 2]
+    uv = uv if move is None else moved(uv, move)
     # Images begin at the top in glTF.
     return uv * [1.0, -1.0] + [0.0, 1.0]
 
 
 def _asked(primitive: Any, image: Any) -> int | None:
     """The set of coordinates that an image is looked up by; None if it isn't there."""
-    which = 0 if image is None else _move(image).get("texCoord", image.texCoord) or 0
+    which = 0 if image is None else _transform(image).get("texCoord", image.texCoord) or 0
     return getattr(primitive.attributes, f"TEXCOORD_{which}", None)
 
 
-def _move(image: Any) -> dict[str, Any]:
+def _transform(image: Any) -> dict[str, Any]:
+    """How an image's coordinates are moved, as the file has it."""
     told = (image.extensions or {}).get("KHR_texture_transform")
     return told if isinstance(told, dict) else {}
 
 
-def _number(told: Mapping[str, Any], name: str) -> float:
-    value = told.get(name, 0.0)
-    return float(value) if isinstance(value, int | float) else 0.0
+def _material(file: GltfFile, primitive: Any) -> Any:
+    which, there = primitive.material, file.document.materials
+    return None if which is None else there[file.index(which, there, "material")]
 
 
-def _base_image(file: GltfFile, primitive: Any) -> Any:
-    if primitive.material is None:
-        return None
-    told = file.document.materials[
-        file.index(primitive.material, file.document.materials, "material")
-    ]
-    plain = told.pbrMetallicRoughness
+def _image(material: Any) -> Any:
+    plain = None if material is None else material.pbrMetallicRoughness
     return None if plain is None else plain.baseColorTexture
 
 
 def _polygons(
-    file: GltfFile, primitive: object, faces: Int[np.ndarray, "faces 3"], *, textured: bool
+    file: GltfFile, primitive: Any, faces: Int[np.ndarray, "faces 3"], *, textured: bool
 ) -> Polygons:
     """Triangles with the material of their primitive."""
     count, materials = len(faces), ()
-    which = primitive.material  # pyright: ignore[reportAttributeAccessIssue]
-    if which is not None:
-        told = file.document.materials[file.index(which, file.document.materials, "material")]
+    told = _material(file, primitive)
+    if told is not None:
         plain = told.pbrMetallicRoughness
         rgba = None if plain is None else plain.baseColorFactor
-        name = str(told.name or f"material{which}")
-        image = _base_image(file, primitive)
+        name = str(told.name or f"material{primitive.material}")
+        image = _image(told)
         texture = None if image is None else make_texture(*file.image(image.index))
         if texture is not None and _asked(primitive, image) is None:
             texture = make_texture(texture.name, None)
-        materials = (
-            make_material(
-                name,
-                [1.0, 1.0, 1.0] if rgba is None else rgba[:3],
-                texture,
-            ),
-        )
+        colour = [1.0, 1.0, 1.0] if rgba is None else rgba[:3]
+        materials = (make_material(name, colour, texture),)
     corners = faces.reshape(-1)
     return Polygons(
         np.full(count, 3, np.int32),

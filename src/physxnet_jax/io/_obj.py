@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from ..errors import FormatError
 from ..files import whole_file
 from ..geometry import Material, Polygons, Texture, make_material
-from ._chart import make_move, moved_charts
+from ._chart import Move, make_move, moved_charts
 from ._clip import StillMesh
 from ._texture import texture_beside, write_textures
 
@@ -141,7 +141,7 @@ class _Look(NamedTuple):
     """A material, and how it moves texture coordinates."""
 
     material: Material
-    move: Float[np.ndarray, "2 3"] | None
+    move: Move | None
 
 
 def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
@@ -170,7 +170,7 @@ def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
     return found
 
 
-def _image(file: pathlib.Path, line: str) -> tuple[Texture, Float[np.ndarray, "2 3"] | None]:
+def _image(file: pathlib.Path, line: str) -> tuple[Texture, Move | None]:
     """What `map_Kd` names, and how its options move coordinates; names may have spaces."""
     rest = _rest(line)
     told = {"s": [1.0, 1.0], "o": [0.0, 0.0]}

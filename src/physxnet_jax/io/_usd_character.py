@@ -11,12 +11,11 @@ from jaxtyping import Float
 
 from ..errors import FormatError, MissingDependencyError
 from ..geometry import Material, Polygons, make_material
-from ._chart import make_move, moved_charts
+from ._chart import Move, make_move, moved_charts
 from ._moving import Moving
 from ._texture import texture_beside
 from ._usd_trial import try_stage
 
-_Move = Float[np.ndarray, "2 3"]
 # Coordinates and frames that are read at most.
 _MOST, _FRAMES = 3e8, 20_000
 
@@ -164,7 +163,7 @@ def _meshes(
 
 def _polygons(
     path: pathlib.Path, prim: Any, counts: np.ndarray, corners: np.ndarray, rows: np.ndarray | None
-) -> tuple[Polygons, dict[int, _Move]]:
+) -> tuple[Polygons, dict[int, Move]]:
     """Faces of a prim, outwards, with the materials that it or its subsets are bound to.
 
     And how those materials that do so move texture coordinates, by number.
@@ -172,7 +171,7 @@ def _polygons(
     from pxr import UsdGeom, UsdShade
 
     found: list[tuple[Material, bytes]] = []
-    moves: dict[int, _Move] = {}
+    moves: dict[int, Move] = {}
 
     def number(at: Any) -> int:
         bound = UsdShade.MaterialBindingAPI(at).ComputeBoundMaterial()[0]
@@ -203,7 +202,7 @@ def _polygons(
     return drawn.reversed(np.arange(len(drawn.counts))) if turned else drawn, moves
 
 
-def _image(told: Any) -> tuple[object, str, _Move | None] | None:
+def _image(told: Any) -> tuple[object, str, Move | None] | None:
     """Tint, file and move of the image that an input is connected to; None for anything else."""
     shader = _connected(told)
     file = shader.GetInput("file") if shader else None
