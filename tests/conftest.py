@@ -3,10 +3,15 @@
 import os
 import pathlib
 
+import hypothesis
 import jaxtyping
 import pytest
 
 jaxtyping.install_import_hook("physxnet_jax", "beartype.beartype")
+
+# The same examples in every run; others are looked for by --hypothesis-profile=default.
+hypothesis.settings.register_profile("seeded", derandomize=True, database=None, deadline=None)
+hypothesis.settings.load_profile("seeded")
 
 import jax  # noqa: E402
 

@@ -12,6 +12,7 @@ import pytest
 from physxnet_jax import fit_garment, inspect_garment, template
 from physxnet_jax.geometry import Texture, make_texture
 from physxnet_jax.io import AnimatedMesh, load_garment, read_mesh, read_obj, write_clip
+from physxnet_jax.io._chart import make_move
 from physxnet_jax.io._texture import texture_beside, write_textures
 
 imageio = pytest.importorskip("imageio.v2")
@@ -325,9 +326,18 @@ def test_obj_coordinates_that_a_material_moves(painted, tmp_path):
     # Written again they need no options.
     write_clip(tmp_path / "a.obj", [worn(painted)], 30.0)
     assert "-s" not in next(tmp_path.glob("*.mtl")).read_text()
-    for broken in ("-s nan 1", "-s 1e300 1", "-o inf inf"):
+    for broken in ("-s nan 1", "-s 1e300 1", "-s inf 1", "-s 1 inf", "-o inf inf"):
         library.write_text(text.replace("-s 1 1 1", broken))
         np.testing.assert_array_equal(read_obj(painted).uv, before.uv)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1e7, 10**400, "x", None, [1.0]])
+def test_moves_of_numbers_that_are_none_are_no_moves(number):
+    assert make_move((2.0, 1.0)) is not None
+    assert make_move((number, 1.0)) is None
+    assert make_move((1.0, number), turned=1.0) is None
+    assert make_move(offset=(0.0, number)) is None
+    assert make_move(turned=number) is None
 
 
 def test_usd_coordinates_that_a_material_moves(painted, tmp_path):

@@ -29,12 +29,13 @@ def make_move(scale: Any = (1.0, 1.0), offset: Any = (0.0, 0.0), turned: Any = 0
     """
     try:
         (su, sv), (ou, ov), angle = map(float, scale), map(float, offset), float(turned)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
+        return None
+    if not all(abs(x) < _MOST for x in (su, sv, ou, ov, angle)):
         return None
     c, s = np.cos(angle), np.sin(angle)
     move = np.array([[c * su, -s * sv, ou], [s * su, c * sv, ov]])
-    same = np.array_equal(move, np.eye(2, 3))
-    return None if same or not (np.abs(move) < _MOST).all() else move
+    return None if np.array_equal(move, np.eye(2, 3)) else move
 
 
 def moved(uv: Float[np.ndarray, "uvs 2"], move: Move) -> Float[np.ndarray, "uvs 2"]:
