@@ -53,6 +53,49 @@ ASF = """:version 1.10
 """
 AMC = ":FULLY-SPECIFIED\n:DEGREES\n1\nroot 0 1 0 0 0 0\nlfemur 10\n2\nroot 0 1 0 0 0 0\nlfemur 20\n"
 
+LEGS = [f"{s}{b}" for s in ("Left", "Right") for b in ("Leg", "Foot")]
+FIGURE = {
+    "Hips": (None, (0, 1, 0)),
+    "Spine": ("Hips", (0, 0.2, 0)),
+    **{f"{s}UpLeg": ("Hips", (x, 0, 0)) for s, x in (("Left", 0.1), ("Right", -0.1))},
+    **{b: (b.replace("Foot", "Leg") if "Foot" in b else b.replace("Leg", "UpLeg"), (0, -0.4, 0))
+       for b in LEGS},
+    **{f"{s}Arm": ("Spine", (x, 0.3, 0)) for s, x in (("Left", 0.2), ("Right", -0.2))},
+    **{f"{s}{b}": (f"{s}{a}", (x, 0, 0)) for s, x in (("Left", 0.25), ("Right", -0.25))
+       for a, b in (("Arm", "ForeArm"), ("ForeArm", "Hand"))},
+}  # fmt: skip
+
+
+def standing_bvh(offsets=None, root=(0, 1, 0), legs=None):
+    """Three frames of a standing figure; `legs` moves the joints of its legs in the clip."""
+    lines, order = ["HIERARCHY"], []
+
+    def add(name):
+        order.append(name)
+        parent, place = FIGURE[name]
+        place = (offsets or {}).get(name, place)
+        moves = parent is None or (legs is not None and name in LEGS)
+        channels = ["Xposition", "Yposition", "Zposition"] * moves
+        channels += ["Zrotation", "Yrotation", "Xrotation"]
+        lines.append(
+            f"{'JOINT' if parent else 'ROOT'} {name}\n{{\nOFFSET {' '.join(map(str, place))}"
+        )
+        lines.append(f"CHANNELS {len(channels)} {' '.join(channels)}")
+        for child, (above, _) in FIGURE.items():
+            if above == name:
+                add(child)
+        lines.append("}")
+
+    add("Hips")
+    row = []
+    for name in order:
+        row += (
+            [*root] if name == "Hips" else [0, legs, 0] if legs is not None and name in LEGS else []
+        )
+        row += [0, 0, 0]
+    lines.append("MOTION\nFrames: 3\nFrame Time: 0.0333333")
+    return "\n".join([*lines, *3 * [" ".join(map(str, row))]]) + "\n"
+
 
 def limbs_apart(body, rest, a, b):
     """Largest angle between limbs of two clips [degrees]."""

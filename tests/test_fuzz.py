@@ -275,6 +275,7 @@ def _weights(name):
 # Name: what a good file holds, its ending, its reader, and how many damages a test tries.
 READERS = {
     "bvh": (lambda f: BVH.encode(), ".bvh", read_bvh, 150),
+    "bvh of a person": (lambda f: _SAMPLES["standing_bvh"]().encode(), ".bvh", load_motion, 150),
     "amc": (lambda f: AMC.encode(), ".amc", _amc, 100),
     "asf": (lambda f: ASF.encode(), ".asf", _asf, 150),
     "motion": (_clip, ".npz", load_motion, 100),

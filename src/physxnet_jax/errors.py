@@ -3,9 +3,17 @@
 import math
 import numbers
 
+# Files are quoted in errors, and may hold anything at any length.
+_MOST, _LAST = 1200, 500
+
 
 class PhysXNetError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base of every error this package raises on purpose; of a long text the middle is left out."""
+
+    def __init__(self, text: str = "") -> None:
+        if len(text) > _MOST:
+            text = f"{text[: _MOST - _LAST]} … {text[-_LAST:]}"
+        super().__init__(text)
 
 
 class MeshError(PhysXNetError, ValueError):

@@ -69,6 +69,33 @@ def write_json(path: str | pathlib.Path, values: object) -> None:
         part.write_text(json_text(values) + "\n", encoding="utf-8")
 
 
+def append_line(path: str | pathlib.Path, values: Mapping[str, Any]) -> None:
+    """Adds a line of JSON to a log; one that a kill cut short before it stays alone."""
+    with pathlib.Path(path).open("a+b") as log:
+        if log.tell():
+            log.seek(-1, os.SEEK_END)
+            if log.read(1) != b"\n":
+                log.write(b"\n")
+        log.write(json.dumps(values).encode() + b"\n")
+
+
+def read_lines(path: str | pathlib.Path) -> list[dict[str, Any]]:
+    """A log of `append_line`: none if there is no file; a line that was cut is left out."""
+    path = pathlib.Path(path)
+    if not path.is_file():
+        return []
+    out = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        with contextlib.suppress(ValueError, RecursionError):
+            out.append(json.loads(line))
+    return [values for values in out if isinstance(values, dict)]
+
+
+def is_file(path: str | pathlib.Path) -> bool:
+    """Whether there is such a file: none of a name that the system can't have."""
+    return os.path.isfile(path)
+
+
 def check_writable(path: str | pathlib.Path) -> None:
     """Fails where a file couldn't be written; makes nothing.
 

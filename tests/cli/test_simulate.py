@@ -26,6 +26,7 @@ from physxnet_jax.simulation import (
     XPBD,
     Air,
     BodyContact,
+    Effect,
     Gravity,
     LayerContact,
     Pin,
@@ -90,6 +91,21 @@ def test_scene_files_say_what_they_hold(tmp_path):
     both = make_scene("walk", ["top", "bottom"])
     assert [g.name for g in both.scene.garments] == ["bottom", "top"], "the innermost first"
     assert LayerContact() in both.scene.effects
+
+
+class Sway(Effect):
+    """An effect of somebody's own."""
+
+
+def test_a_scene_keeps_effects_of_ones_own_and_nothing_twice():
+    wind = Air(wind=(0.0, 0.0, 4.0))
+    scene = make_scene("walk", "bottom", effects=[Pin(), Sway(), Gravity(), wind]).scene
+    assert [type(e) for e in scene.effects] == [Gravity, Air, Sway, Pin]
+    calm = Air(wind=(0.0, 0.0, 0.0))
+    assert make_scene("walk", "bottom", effects=[wind], also=[calm]).scene.effects == (calm,)
+    twice = make_scene("walk", "bottom", effects=[wind, calm]).scene
+    with pytest.raises(SimulationError, match="listed twice"):
+        prepare_scene(twice)
 
 
 def test_what_dress_tells_of_a_garment_file_is_told_here_too(tmp_path, capsys):

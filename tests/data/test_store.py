@@ -22,6 +22,7 @@ from physxnet_jax.data import (
     load_action,
     make_codec,
     open_dataset,
+    read_log,
     read_protocol,
     read_sequence,
     write_action,
@@ -29,6 +30,7 @@ from physxnet_jax.data import (
     write_offsets,
 )
 from physxnet_jax.data._build import action_motion
+from physxnet_jax.data._store import log_build
 from physxnet_jax.errors import FormatError, MotionError
 from physxnet_jax.evaluation import skinning
 from physxnet_jax.garment import square_sheet, template
@@ -217,6 +219,26 @@ def test_what_is_left_of_clips_overlaps_no_action(data_dir):
         assert load_action(data_dir / "mocap", a).num_frames == a.frames
 
 
+def test_a_log_that_a_kill_cut_short_is_gone_on_with(tmp_path):
+    for k in range(2):
+        log_build(tmp_path, {"k": k})
+    log = tmp_path / "build_log.jsonl"
+    log.write_bytes(log.read_bytes() + b'{"k": 2, "sec')
+    assert [line["k"] for line in read_log(tmp_path)] == [0, 1]
+    log_build(tmp_path, {"k": 3})
+    assert [line["k"] for line in read_log(tmp_path)] == [0, 1, 3]
+    assert read_log(tmp_path / "none") == []
+
+
+@pytest.mark.parametrize("text", ["{", "[]", "\xff"])
+def test_a_damaged_note_of_a_dataset_is_told_of(tmp_path, text):
+    open_dataset(tmp_path, {"fps": 30})
+    open_dataset(tmp_path, {"fps": 30})
+    (tmp_path / "dataset.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(FormatError, match=r"damaged|another configuration"):
+        open_dataset(tmp_path, {"fps": 30})
+
+
 @pytest.mark.parametrize(("left", "speed"), [(False, 1.25), (True, 0.8)])
 def test_a_dataset_knows_how_long_its_actions_are(data_dir, tmp_path, left, speed):
     folder = data_dir / "mocap"
@@ -251,7 +273,7 @@ def test_actions_without_a_folder_of_their_own_are_refused(tmp_path, names):
 
 
 def test_what_is_left_of_a_clip_begins_after_the_longest_action(tmp_path):
-    """An action within another: what lies after the inner one is still used."""
+    """An action within another: what lies after the inner one is still used, and once."""
     walk = load_motion("walk", fps=30.0)
     turns = np.tile(np.asarray(walk.rotations), (8, 1, 1))[:600]
     root = np.tile(np.asarray(walk.root), (8, 1))[:600]
@@ -261,7 +283,7 @@ def test_what_is_left_of_a_clip_begins_after_the_longest_action(tmp_path):
         "train,long,a.npz,0.0,300\ntrain,short,a.npz,2.0,30\n"
     )
     found = left_out(tmp_path, read_protocol(tmp_path))
-    assert [a.start for a in found] == [10.0, 10.0]
+    assert [(a.name, a.start) for a in found] == [("long", 10.0)]
 
 
 @pytest.mark.parametrize(

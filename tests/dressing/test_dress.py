@@ -49,7 +49,8 @@ def test_another_clip_of_another_length_compiles_nothing():
 
 
 def test_the_simulation_is_what_its_own_rollout_says():
-    clip = dress("balance", ["bottom"], method="simulate", frames=4)
+    # One garment needn't be a list.
+    clip = dress("balance", template("bottom"), method="simulate", frames=4)
     assert np.isfinite(clip.garments[0].positions).all()
     waist = np.asarray(template("bottom").pinned)
     lbs = dress("balance", ["bottom"], method="lbs", frames=4, push_out=False)

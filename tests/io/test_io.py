@@ -3,6 +3,9 @@
 import dataclasses
 import hashlib
 import json
+import os
+import subprocess
+import sys
 
 import jax
 import numpy as np
@@ -231,6 +234,19 @@ def test_a_mean_of_networks_names_what_it_averages(tmp_path):
         card.write_text(json.dumps(read_card("pair") | {"mean_of": named}))
         with pytest.raises(WeightsError, match="networks of this"):
             load_predictor(card.parent)
+
+
+def test_loading_weights_draws_no_random_numbers():
+    """As a fresh process has it: what is drawn is compiled first, which takes seconds."""
+    code = "from physxnet_jax.io import load_predictor; load_predictor('nano')"
+    told = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "JAX_LOG_COMPILES": "1"},
+    )
+    assert told.returncode == 0, told.stderr[-2000:]
+    assert "Compiling jit(" in told.stderr and "truncated_normal" not in told.stderr
 
 
 def test_packaged_weights_load_and_damage_is_noticed(tmp_path):

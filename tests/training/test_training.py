@@ -248,9 +248,15 @@ def test_losses_along_edges_and_of_larger_parts_teach(tmp_path):
         ({"scales": 0}, "at least 1"),
         ({"scales": 7}, "halve that often"),
         ({"scales": 2, "squared": True}, "choose one"),
+        ({"epochs": 0}, "epochs is 0"),
+        ({"patience": 0}, "patience is 0"),
+        ({"batch": 0}, "batch is 0"),
+        ({"checkpoint_every": -1}, "checkpoint_every is -1"),
+        ({"learning_rate": float("nan")}, "learning_rate is nan"),
+        ({"momentum": 1.0}, "momentum is 1.0"),
     ],
 )
-def test_losses_that_can_not_be_are_refused(changes, says):
+def test_runs_that_can_not_be_are_refused(changes, says):
     with pytest.raises(ValueError, match=says):
         dataclasses.replace(CONFIG, **changes)
 

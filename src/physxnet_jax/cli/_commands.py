@@ -121,7 +121,7 @@ class Fit:
     edge_length: float | None = None
     """Split edges that are longer than this [mm]."""
     decimate: float | None = None
-    """Before that, make it coarser: edges of about this length [mm]; drops texture coordinates."""
+    """Before that, make it coarser: edges of about this length [mm]."""
     drape: bool = False
     """At last let it down onto the body by its weight: for straps that hang in the air."""
     json: bool = False
@@ -245,7 +245,7 @@ class View:
     motion: tyro.conf.Positional[str] = "walk"
     """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
     wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and OBJ files."""
+    """Templates (top, bottom, dress) and garment files."""
     method: Literal["network", "lbs", "simulate"] = "network"
     """network, lbs (skinning alone) or simulate."""
     weights: str = "local+relax"
@@ -301,7 +301,7 @@ class Export:
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the function (StableHLO), triangles, a card and a loader."""
     wear: tuple[str, ...] = ("top", "bottom")
-    """Garments: OBJ files or top, bottom, dress."""
+    """Garments: files or top, bottom, dress."""
     weights: str = "local+relax"
     """Name or folder of network weights, as for dress."""
     fps: float = 30.0

@@ -22,7 +22,7 @@ class Simulate:
     scene: tyro.conf.Positional[str]
     """A scene file (.toml), a motion file, or a built-in clip."""
     wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and OBJ files; a scene file names its own."""
+    """Templates (top, bottom, dress) and garment files; a scene file names its own."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Result: .usdc, .usd, .usda, .pc2, .mdd (with OBJ), .glb, .html, .obj (one a frame), .npz."""
     preview: pathlib.Path | None = None
@@ -72,7 +72,7 @@ class Effects:
     scene: tyro.conf.Positional[str]
     """A scene file (.toml), a motion file, or a built-in clip."""
     wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and OBJ files; a scene file names its own."""
+    """Templates (top, bottom, dress) and garment files; a scene file names its own."""
     frames: int | None = 20
     """Frames that are simulated."""
     source_fps: float | None = None

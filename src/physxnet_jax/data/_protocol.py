@@ -119,12 +119,17 @@ def left_out(folder: str | pathlib.Path, actions: list[Action]) -> list[Action]:
         actions: Whose clips are asked for.
 
     Returns:
-        Actions of the same names and splits, with other frames.
+        Actions of the same names and splits, with other frames; of several cut from one
+        clip the first.
     """
     folder = pathlib.Path(folder)
     everything = read_protocol(folder)
-    out = []
+    out, looked = [], set()
     for action in actions:
+        # Of two actions cut from one clip the second would be given the same stretch again.
+        if action.file in looked:
+            continue
+        looked.add(action.file)
         same = [a for a in everything if a.file == action.file]
         if any(a.split == "test" for a in same):
             continue

@@ -9,6 +9,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import math
 import os
 import pathlib
 import shutil
@@ -20,13 +21,15 @@ import tensorstore as ts
 from jaxtyping import Float, Int
 
 from ..errors import FormatError
-from ..files import read_arrays, whole_file
+from ..files import append_line, read_arrays, read_lines, whole_file
 from ..motion import Motion, load_motion, save_motion
 from ._codec import Codec, make_codec
 
 # Offsets are stored as whole tenths of a millimetre: the error is at most 0.05 mm.
 QUANTUM = 1e-4
 _LARGEST = 3.2
+# Coordinates of a garment in an action that are read at most.
+_MOST = 3e8
 _NOTE = "dataset.json"
 # Times differ from run to run: they are no part of what a dataset is.
 _LOG = "build_log.jsonl"
@@ -61,7 +64,7 @@ def open_dataset(root: str | pathlib.Path, note: dict[str, Any]) -> None:
     path = pathlib.Path(root) / _NOTE
     text = json.dumps(note, indent=1, sort_keys=True)
     if path.is_file():
-        if json.loads(path.read_text()) != json.loads(text):
+        if read_note(root) != json.loads(text):
             raise FormatError(
                 f"{root}: a dataset of another configuration lies there. Choose another"
                 " folder or delete it."
@@ -81,7 +84,13 @@ def read_note(root: str | pathlib.Path) -> dict[str, Any]:
     if not path.is_file():
         raise FormatError(f"{root}: no {_NOTE}, not a dataset; build one first.")
     with _damage_told(path):
-        return json.loads(path.read_text())
+        return _table(json.loads(path.read_text()))
+
+
+def _table(told: object) -> dict[str, Any]:
+    if not isinstance(told, dict):
+        raise TypeError("not a table")
+    return told
 
 
 def write_garment(
@@ -126,14 +135,28 @@ def write_garment(
 @functools.lru_cache(maxsize=8)
 def _codec(path: pathlib.Path, changed: int) -> Codec:
     data = _archive(path)
-    return Codec(*(data[k].astype(np.int64) for k in ("order", "parents", "weights")))
+    order, parents, weights = (data[k].astype(np.int64) for k in ("order", "parents", "weights"))
+    return Codec(order, parents, weights)
 
 
 def _archive(path: pathlib.Path) -> dict[str, np.ndarray]:
     names = ("vertices", "faces", "order", "parents", "weights")
     with _damage_told(path):
         data = read_arrays(path, names)
-        return {name: data[name] for name in names}
+        data = {name: data[name] for name in names}
+        count = len(data["vertices"])
+        whole = [data[k] for k in ("faces", "order", "parents", "weights")]
+        if data["vertices"].dtype.kind != "f" or any(x.dtype.kind not in "iu" for x in whole):
+            raise TypeError("arrays of other kinds")
+        shapes = (data["parents"].shape, data["weights"].shape)
+        if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][0] != count:
+            raise ValueError("arrays of other shapes")
+        places = (data["parents"], data["faces"], data["order"])
+        if any(x.min(initial=0) < 0 or x.max(initial=0) >= count for x in places):
+            raise ValueError("vertices that aren't there")
+        if not np.array_equal(np.sort(data["order"]), np.arange(count)):
+            raise ValueError("no order of the vertices")
+        return data
 
 
 @contextlib.contextmanager
@@ -143,7 +166,7 @@ def _damage_told(path: pathlib.Path) -> Iterator[None]:
         yield
     except FormatError:
         raise
-    except (ValueError, LookupError, TypeError, OSError) as error:
+    except (ValueError, LookupError, TypeError, OSError, RecursionError) as error:
         raise FormatError(
             f"{path}: damaged ({type(error).__name__}). Delete its folder and build the dataset"
             " again: only this part will be simulated."
@@ -230,17 +253,21 @@ def read_offsets(folder: pathlib.Path, template: str) -> Float[np.ndarray, "fram
         FormatError: Damaged.
     """
     path = folder / template
+    codec, frames = _codec_of(folder, template), read_meta(folder, template).get("frames")
     with _damage_told(path):
         spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(path)}}
         store = ts.open(spec, read=True).result()
+        # Before memory is asked for: a kilobyte may announce gigabytes of nothing.
+        fits = store.shape == (3, len(codec.order), frames) and store.dtype == ts.uint32
+        if not fits or math.prod(store.shape) > _MOST:
+            raise ValueError("an array of another shape")
         left = np.ascontiguousarray(store.read().result())
-    if hashlib.sha256(left.tobytes()).hexdigest() != read_meta(folder, template)["sha256"]:
+    if hashlib.sha256(left.tobytes()).hexdigest() != read_meta(folder, template).get("sha256"):
         raise FormatError(
             f"{folder.name}/{template}: the checksum is wrong; delete that folder and build"
             " the dataset again, only this part will be simulated."
         )
-    whole = _codec_of(folder, template).decode(left)
-    return whole.astype(np.float32) * np.float32(QUANTUM)
+    return codec.decode(left).astype(np.float32) * np.float32(QUANTUM)
 
 
 def read_meta(folder: pathlib.Path, template: str) -> dict[str, Any]:
@@ -251,7 +278,7 @@ def read_meta(folder: pathlib.Path, template: str) -> dict[str, Any]:
     """
     path = folder / template / "zarr.json"
     with _damage_told(path):
-        return json.loads(path.read_text())["attributes"]
+        return _table(_table(json.loads(path.read_text()))["attributes"])
 
 
 def is_stored(folder: pathlib.Path, template: str) -> bool:
@@ -328,14 +355,12 @@ def _action_note(path: pathlib.Path) -> dict[str, str]:
 
 def log_build(root: str | pathlib.Path, line: dict[str, Any]) -> None:
     """Adds a line to the log of a build: what took how long."""
-    with (pathlib.Path(root) / _LOG).open("a") as file:
-        file.write(json.dumps(line) + "\n")
+    append_line(pathlib.Path(root) / _LOG, line)
 
 
 def read_log(root: str | pathlib.Path) -> list[dict[str, Any]]:
-    """The log of a build."""
-    path = pathlib.Path(root) / _LOG
-    return [json.loads(x) for x in path.read_text().splitlines()] if path.is_file() else []
+    """The log of a build; a line cut by a kill is left out."""
+    return read_lines(pathlib.Path(root) / _LOG)
 
 
 def _unfinished(path: pathlib.Path) -> bool:

@@ -15,7 +15,14 @@ from ..garment import Garment
 from ..geometry import each_frame
 from ..models import Predictor, Wearable, dress_frames, skin_wearable
 from ..motion import BLOCK, Motion, padded_block
-from ..simulation import ACCURACY, Scene, prepare_scene, simulate_batch, standard_effects
+from ..simulation import (
+    ACCURACY,
+    ROLLOUT_BLOCK,
+    Scene,
+    prepare_scene,
+    simulate_batch,
+    standard_effects,
+)
 from ._layers import Layer, inside_out, keep_layers_apart
 from ._push_out import SkinPatch, push_out, skin_height
 from ._stages import Stage
@@ -148,7 +155,7 @@ def simulate_clip(
     rollout = simulate_batch(prepare_scene(scene), [clip], solver=solver, progress=tick)[0]
     rollout.check()
     laps = 1e3 * np.diff(ticks)
-    warm = float(np.median(laps[1:])) / 10 if len(laps) > 1 else None
+    warm = float(np.median(laps[1:])) / ROLLOUT_BLOCK if len(laps) > 1 else None
     stages.append(Stage("simulation", float(laps[0]), warm))
     return dict(zip([g.name for g in order], rollout.positions, strict=True))
 

@@ -43,7 +43,7 @@ class Cost:
         ms_backward: The vertices and the gradient of their squares with respect to
             rotations, root and the network's parameters, a frame [ms]; NaN if not asked for.
         cold_s: The first call, compilation included [s].
-        params: Numbers the network has learned, and statistics of its batch norm.
+        params: Numbers the network computes with, its batch norm folded away.
         flops: Of a call, as the compiler counts them; NaN with push-out or relaxation,
             whose loops it counts once.
         weights_mb: Size of the weights' file [MB].

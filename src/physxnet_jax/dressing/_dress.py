@@ -2,7 +2,7 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Literal
 
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ from ._character import (
     on_character,
 )
 from ._layers import make_layers
-from ._meshes import animated_meshes, worn_garments
+from ._meshes import Wear, animated_meshes, worn_garments
 from ._push_out import make_patch, tuck_in
 from ._stages import Stage, Watch
 from ._wanted_clip import wanted_clip
@@ -82,7 +82,7 @@ class DressedClip:
 
 def dress(
     motion: Motion | Character | str | pathlib.Path,
-    wear: Sequence[Garment | str | pathlib.Path] = ("top", "bottom"),
+    wear: Wear = ("top", "bottom"),
     *,
     method: Method = "network",
     accuracy: str = "standard",
@@ -101,7 +101,7 @@ def dress(
     Args:
         motion: A motion, a motion file, the name of a built-in clip, or a person of one's
             own (`load_character`), who brings body, shape and frame rate along.
-        wear: Garments, OBJ files or template names. Tops go over dresses, dresses over
+        wear: Garments, garment files or template names. Tops go over dresses, dresses over
             trousers; of two of one kind the first is beneath.
         method: ``network`` (packaged weights), ``lbs`` (skinning alone, the baseline)
             or ``simulate`` (the cloth simulator, the network's teacher).
@@ -114,7 +114,7 @@ def dress(
         shape: Shape parameters; the default shape if omitted.
         include_body: Put the body's mesh into the result.
         push_out: Push vertices that end inside the body onto it, and garments off those
-            beneath them (network and lbs).
+            beneath them (network and lbs; on a character's skin simulated cloth, too).
         progress: Called with a stage, frames done and frames in all.
 
     Returns:

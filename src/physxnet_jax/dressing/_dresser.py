@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 import pathlib
-from collections.abc import Sequence
 from typing import Literal
 
 import jax
@@ -27,7 +26,7 @@ from ..motion import poses_before
 from ..typing import pytree
 from ._dress import as_on, bound_wearable, fit_surface
 from ._layers import Layer, keep_apart, keep_layers_apart, make_layers
-from ._meshes import worn_garments
+from ._meshes import Wear, worn_garments
 from ._push_out import SkinPatch, make_patch, push_out, tuck_in
 
 Precision = Literal["float32", "bfloat16"]
@@ -107,7 +106,7 @@ def _check_pose(body: Body, rotations: Array, root: Array, axes: tuple[str, ...]
 
 
 def make_dresser(
-    wear: Sequence[Garment | str | pathlib.Path] = ("top", "bottom"),
+    wear: Wear = ("top", "bottom"),
     *,
     weights: str | pathlib.Path | Predictor = DEFAULT,
     body: Body | None = None,
@@ -118,7 +117,7 @@ def make_dresser(
     """Loads weights and binds garments, once for all poses.
 
     Args:
-        wear: Garments, OBJ files or template names. Tops go over dresses, dresses over
+        wear: Garments, garment files or template names. Tops go over dresses, dresses over
             trousers; of two of one kind the first is beneath.
         weights: Name or folder of network weights, or a predictor.
         body: The body; the built-in one by default.

@@ -13,6 +13,9 @@ from ..garment import TEMPLATES, Garment, template
 from ..io import AnimatedMesh, load_garment
 from ..motion import Motion, body_animation
 
+Wear = Sequence[Garment | str | pathlib.Path] | Garment | str | pathlib.Path
+"""Garments, garment files or names of templates, or one of them."""
+
 _COLOURS = ((0.16, 0.27, 0.55), (0.55, 0.28, 0.20), (0.25, 0.45, 0.30), (0.45, 0.25, 0.45))
 _SKIN_COLOUR = (0.69, 0.46, 0.33)
 
@@ -59,13 +62,11 @@ def animated_meshes(
     return tuple(meshes)
 
 
-def worn_garments(
-    wear: Sequence[Garment | str | pathlib.Path], body: Body
-) -> tuple[list[Garment], tuple[str, ...]]:
+def worn_garments(wear: Wear, body: Body) -> tuple[list[Garment], tuple[str, ...]]:
     """Garments with names that differ, and what to know about the files they come from.
 
     Args:
-        wear: Garments, garment files or template names.
+        wear: Garments, garment files or template names, or one of them.
         body: What files are modelled on.
 
     Raises:
@@ -73,8 +74,8 @@ def worn_garments(
     """
     taken = {"body"}
     garments, notes = [], []
-    # One word is a sequence of letters.
-    wear = [wear] if isinstance(wear, str) else wear
+    # One word is a sequence of letters; a path or a garment is none at all.
+    wear = [wear] if isinstance(wear, str | pathlib.Path | Garment) else wear
     for word in wear:
         if isinstance(word, Garment):
             garment = word

@@ -10,13 +10,25 @@ from jaxtyping import Array, Float
 
 from ..body import load_body
 from ..errors import FormatError
+from ..files import is_file
 from ..garment import FABRICS, Garment
 from ..motion import Motion, sudden_turns
-from ..simulation import ACCURACY, EFFECTS, Air, Damping, Effect, Scene, standard_effects
+from ..simulation import (
+    ACCURACY,
+    EFFECTS,
+    Air,
+    Damping,
+    Effect,
+    Scene,
+    SelfContact,
+    standard_effects,
+)
 from ._layers import inside_out
-from ._meshes import worn_garments
+from ._meshes import Wear, worn_garments
 from ._wanted_clip import wanted_clip
 
+# Beyond this a whole number is no setting, and no float either.
+_LARGEST = 10**12
 _KEYS: dict[str, type | tuple[type, ...]] = {
     "motion": str,
     "source_fps": (int, float),
@@ -52,7 +64,7 @@ class SceneFile:
 
 def make_scene(
     motion: str | pathlib.Path | Motion,
-    wear: Sequence[str | pathlib.Path | Garment] = ("top", "bottom"),
+    wear: Wear = ("top", "bottom"),
     *,
     fps: float | None = None,
     source_fps: float | None = None,
@@ -70,7 +82,7 @@ def make_scene(
 
     Args:
         motion: A motion, a motion file, or the name of a built-in clip.
-        wear: Garments, OBJ files or template names; put into the order of layers.
+        wear: Garments, garment files or template names; put into the order of layers.
         fps: Frames a second; a `Motion`'s own if omitted, else 30.
         source_fps: True rate of a motion file [1/s], where its header is wrong or silent.
         skeleton: The ASF of an AMC file, if it doesn't lie beside it.
@@ -146,19 +158,21 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         FormatError: Not TOML, an unknown key, effect or setting.
     """
     path = pathlib.Path(path)
-    if not path.is_file():
+    if not is_file(path):
         raise FormatError(f"{path}: no such file. Check the path.")
     try:
         with path.open("rb") as file:
             text = tomllib.load(file)
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    # TOMLDecodeError is one of ValueError; so are numbers that Python refuses.
+    except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: not a scene in TOML: {error}.") from None
     unknown = sorted(set(text) - set(_KEYS))
     if unknown or "motion" not in text:
         wrong = f"unknown key {unknown[0]}" if unknown else "no key motion"
         raise FormatError(f"{path}: {wrong}; a scene has {', '.join(_KEYS)}.")
     for key, value in text.items():
-        if not isinstance(value, _KEYS[key]) or isinstance(value, bool):
+        huge = isinstance(value, int) and abs(value) > _LARGEST
+        if not isinstance(value, _KEYS[key]) or isinstance(value, bool) or huge:
             raise FormatError(f"{path}: {key} can't be {value!r}"[:300] + ".")
     wrong = [k for k, v in text.get("shape", {}).items() if not isinstance(v, int | float)]
     if wrong:
@@ -215,7 +229,7 @@ def _beside(path: pathlib.Path, word: str) -> str | pathlib.Path:
     there = path.parent / word
     # A garment may have "=top" behind it.
     files = (there, path.parent / word.rpartition("=")[0])
-    return there if any(f.is_file() for f in files) else word
+    return there if any(map(is_file, files)) else word
 
 
 def _effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:
@@ -235,13 +249,15 @@ def _effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:
             raise FormatError(f"{path}: {name} has no '{unknown[0]}'; it has {there}.")
         try:
             out.append(kind(**{k: _value(fields[k], v) for k, v in settings.items()}))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise FormatError(f"{path}: {name}: {error}"[:300] + ".") from None
     return out
 
 
 def _value(field: dataclasses.Field, value: Any) -> Any:
     if isinstance(value, list):
+        if any(isinstance(v, list) for v in value):
+            raise TypeError(f"{field.name} is a list of lists")
         return tuple(_value(field, v) for v in value)
     wants_float = field.type is float or "float" in str(field.type)
     if wants_float and (isinstance(value, bool) or not isinstance(value, int | float)):
@@ -254,7 +270,9 @@ def _value(field: dataclasses.Field, value: Any) -> Any:
 
 
 def _merged(effects: Sequence[Effect], also: Sequence[Effect]) -> tuple[Effect, ...]:
-    """Both together, in the order of `EFFECTS`."""
-    kinds = {type(e): e for e in (*effects, *also)}
-    rank = list(EFFECTS.values())
-    return tuple(sorted(kinds.values(), key=lambda e: rank.index(type(e))))
+    """Both together, in the order of `EFFECTS`; effects of one's own before all contact."""
+    rank = {kind: k for k, kind in enumerate(EFFECTS.values())}
+    own = rank[SelfContact] - 0.5
+    new = {type(e) for e in also}
+    kept = [e for e in effects if type(e) not in new]
+    return tuple(sorted((*kept, *also), key=lambda e: rank.get(type(e), own)))

@@ -13,6 +13,7 @@ from ..errors import MissingDependencyError, PhysXNetError
 from ..garment import Fabric, Garment, square_sheet, template
 from ..motion import Motion, load_motion
 from ..simulation import (
+    ROLLOUT_BLOCK,
     XPBD,
     Bend,
     BodyContact,
@@ -255,7 +256,7 @@ def _run(b: BenchScene, prepared: PreparedScene, solver: Solver) -> tuple[Rollou
     out = simulate_batch(
         prepared, [b.motion], solver=solver, progress=lambda *_: ticks.append(time.perf_counter())
     )[0]
-    return out, (np.diff(ticks) / 10).tolist()
+    return out, (np.diff(ticks) / ROLLOUT_BLOCK).tolist()
 
 
 def _timed(
@@ -272,7 +273,7 @@ def _timed(
         for _ in range(repeats if b.motion is None else 1):
             warm = warm + _run(b, prepared, solver)[1]
     typical = float(np.median(warm))
-    cold = first - typical * len(laps) * (b.frames if b.motion is None else 10)
+    cold = first - typical * len(laps) * (b.frames if b.motion is None else ROLLOUT_BLOCK)
     return out.positions[0], 1e3 * typical, max(cold, 0.0)
 
 

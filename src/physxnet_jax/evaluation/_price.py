@@ -10,6 +10,7 @@ import numpy as np
 
 from ..motion import Motion
 from ..simulation import (
+    ROLLOUT_BLOCK,
     Air,
     BodyContact,
     Damping,
@@ -215,7 +216,7 @@ def _measure(
             1e3 * float(gap.max()),
             float(np.quantile(edge_strain(prepared.assembly, x), 0.99)),
             float((inside.cloth_inside & ~inside.pinched).mean()),
-            1e3 * float(np.median(laps[1:] if len(laps) > 1 else laps)) / 10,
+            1e3 * float(np.median(laps[1:] if len(laps) > 1 else laps)) / ROLLOUT_BLOCK,
             flops / 1e6,
             float(laps[0]),
         ),

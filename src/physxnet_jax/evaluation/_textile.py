@@ -42,7 +42,8 @@ class Drape:
 
     Attributes:
         coefficient: Shadow beyond the support, of what it would be if flat [%].
-        folds: Around the edge.
+        folds: Around the edge: how often its distance from the axis goes out and in,
+            by the strongest mode.
         speed: Of the fastest vertex at the end [m/s]: whether it has come to rest.
         positions: Of the specimen [m], support in the middle, y up.
         faces: Its triangles.
@@ -184,7 +185,7 @@ def _shadow(x: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"
 
 
 def _folds(rest: Float[np.ndarray, "vertices 3"], x: Float[np.ndarray, "vertices 3"]) -> int:
-    """Maxima of the rim's distance from the axis, smoothed."""
+    """The strongest mode of the rim's distance from the axis: how often it goes out and in."""
     rim = np.flatnonzero(np.hypot(rest[:, 0], rest[:, 2]) > 0.999 * _SPECIMEN)
     rim = rim[np.argsort(np.arctan2(rest[rim, 2], rest[rim, 0]))]
     r = np.hypot(x[rim, 0], x[rim, 2])

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import FormatError
-from ..files import read_arrays
+from ..files import is_file, read_arrays
 from ..motion import GLTF_FORMATS, Motion, nominal_rate
 from ._clip import AnimatedMesh
 from ._mdd import read_mdd
@@ -24,6 +24,8 @@ CHARACTER_FORMATS = (".glb", ".gltf", ".vrm", ".usdc", ".usd", ".usda", ".pc2", 
 # Coordinates of a clip that are read at most.
 _MOST = 3e8
 _FARTHEST = 1e18
+# Frames a second that a file may say, at least: one an hour.
+_SLOWEST = 1 / 3600
 # Heights of a person [m], grown or a child, in units that programs write.
 _HEIGHTS = (0.8, 2.6)
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254}
@@ -79,7 +81,7 @@ def read_character(
             f"{path}: no animated person is read from '{suffix}', only from"
             f" {', '.join(CHARACTER_FORMATS)}."
         )
-    if not path.is_file():
+    if not is_file(path):
         raise FormatError(f"{path}: no such file. Check the path.")
     if motion is not None and suffix not in GLTF_FORMATS:
         raise FormatError(
@@ -116,7 +118,8 @@ def read_character(
         raise FormatError(f"{path}: {whole.positions.size:,} coordinates. Cut the clip.")
     # Beyond that their squares aren't finite in float32.
     binds = np.zeros(1) if whole.bind is None else whole.bind
-    if not all((np.abs(x) < _FARTHEST).all() for x in (whole.positions, binds)):
+    chart = np.zeros(1) if whole.uv is None else whole.uv
+    if not all((np.abs(x) < _FARTHEST).all() for x in (whole.positions, binds, chart)):
         raise FormatError(f"{path}: positions that aren't finite. Export it again.")
     # A glTF tells its times: it was read at the rate that is wanted.
     rate = (rate if suffix in GLTF_FORMATS else source_fps or rate) or 30.0
@@ -148,15 +151,19 @@ def _read_npz(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | Non
                 f" '{prefix}faces' beside it."
             )
         _check_faces(path, faces, x.shape[1])
+        x = x.astype(np.float32, copy=False)
         parts.append(Moving(prefix.rstrip("_") or "body", x, faces.astype(np.int32)))
-    rate = data.get("fps")
-    if rate is not None and (rate.size != 1 or not _numbers(rate) or not 0 < float(rate) < 1e4):
+    told = data.get("fps")
+    if told is None:
+        return parts, None, None
+    rate = float(told.reshape(())) if told.size == 1 and _numbers(told) else 0.0
+    if not _SLOWEST <= rate < 1e4:
         raise FormatError(f"{path}: fps isn't a positive number.")
-    return parts, None if rate is None else float(rate), None
+    return parts, rate, None
 
 
 def _numbers(x: np.ndarray) -> bool:
-    return np.issubdtype(x.dtype, np.floating) or np.issubdtype(x.dtype, np.integer)
+    return x.dtype.kind in "fiu" and x.dtype.itemsize <= 8
 
 
 def _check_faces(path: pathlib.Path, faces: np.ndarray, vertices: int) -> None:
@@ -173,7 +180,7 @@ def _check_faces(path: pathlib.Path, faces: np.ndarray, vertices: int) -> None:
 
 def _read_cache(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, str | None]:
     beside = path.with_suffix(".obj")
-    if not beside.is_file():
+    if not is_file(beside):
         raise FormatError(
             f"{path}: a cache has points alone; put the OBJ of its faces beside it, {beside.name}."
         )

@@ -255,6 +255,8 @@ def _skinned(
 ) -> Moving:
     skin = file.document.skins[file.index(which, file.document.skins, "skin")]
     joints = [file.index(j, file.document.nodes, "joint") for j in skin.joints]
+    if len(set(joints)) < len(joints) or not joints:
+        raise FormatError(f"{file.path}: a skin without joints, or one that is in it twice.")
     binds = np.tile(np.eye(4), (len(joints), 1, 1))
     if skin.inverseBindMatrices is not None:
         told = np.asarray(file.accessor(skin.inverseBindMatrices), float)

@@ -35,7 +35,8 @@ def place_like(
         upright = vertices @ np.array(turns, np.float64).T
         for quarter in range(4):
             size = np.ptp(upright, axis=0)
-            if size[1] > 0:
+            # What is flat in this position has no height to be scaled to.
+            if size[1] > 1e-6 * size.max() > 0:
                 scale = _in_its_unit(float((high - low)[1] / size[1]))
                 unlike = float(np.mean(np.abs(scale * size - (high - low))))
                 # Hung from where it is held: neck or waist.

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import FormatError
+from ..files import is_file
 from ._clip import StillMesh
 from ._moving import Moving, joined, named, welded
 from ._obj import read_obj
@@ -48,7 +49,7 @@ def read_mesh(path: str | pathlib.Path) -> StillMesh:
             f"{path}: no garment is read from '{suffix}', only from {', '.join(GARMENT_FORMATS)}."
             " Export the mesh as one of these (triangles or quads, with uv)."
         )
-    if not path.is_file():
+    if not is_file(path):
         raise FormatError(f"{path}: no such file. Check the path.")
     if path.stat().st_size > _MAX_BYTES:
         raise FormatError(f"{path}: over 500 MB. Decimate the mesh first.")

@@ -12,6 +12,8 @@ from ..geometry import Polygons, joined_polygons
 
 # Vertices within this share of a mesh's size of each other, in all frames, are one.
 _TOGETHER = 3e-6
+# As many ways from one place are told apart.
+_PARTINGS = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +109,7 @@ def _parted(
     """
     size = max(float(np.ptp(x[0], axis=0).max()), 1e-9)
     rows = np.flatnonzero(np.bincount(index)[index] > 1)
-    while len(rows):
+    for _ in range(_PARTINGS):
         leads = first[index[rows]]
         far = np.zeros(len(rows), dtype=bool)
         for frame in x:
@@ -117,7 +119,11 @@ def _parted(
         _, begin, group = np.unique(index[rows], return_index=True, return_inverse=True)
         index[rows] = len(first) + group
         first = np.concatenate([first, rows[begin]])
-    return first, index
+        if not len(rows):
+            return first, index
+    # Many in one place that all go their own ways were never one.
+    index[rows] = len(first) + np.arange(len(rows))
+    return np.concatenate([first, rows]), index
 
 
 def welded(part: Moving) -> Moving:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import FormatError
-from ..files import whole_file
+from ..files import is_file, whole_file
 from ..geometry import Material, Polygons, Texture, make_material
 from ._chart import Move, make_move, moved_charts
 from ._clip import StillMesh
@@ -41,7 +41,7 @@ def read_obj(path: str | pathlib.Path, part: str | None = None) -> StillMesh:
             values that aren't finite; no part of that name. File, line and fix are named.
     """
     path = pathlib.Path(path)
-    if not path.is_file():
+    if not is_file(path):
         raise FormatError(f"{path}: no such file. Check the path.")
     if path.stat().st_size > _MAX_BYTES:
         raise FormatError(f"{path}: over 500 MB. Decimate the mesh first.")
@@ -147,10 +147,11 @@ class _Look(NamedTuple):
 def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
     """Materials of the material files beside a mesh; what can't be read tells nothing."""
     found: dict[str, _Look] = {}
-    for library in libraries:
+    images: dict[str, Texture] = {}
+    for library in dict.fromkeys(libraries):
         # Only what lies beside it: a name may lead anywhere.
         file = path.parent / pathlib.PurePath(library.replace("\\", "/")).name
-        if not file.is_file() or file.stat().st_size > _MAX_LIBRARY:
+        if not is_file(file) or file.stat().st_size > _MAX_LIBRARY:
             continue
         name, colour, image, move = None, None, None, None
         for line in file.read_bytes().decode("utf-8", "replace").splitlines():
@@ -161,7 +162,10 @@ def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
                 with contextlib.suppress(ValueError):
                     colour = [float(w) for w in words[1:4]]
             elif words[:1] == ["map_Kd"] and words[1:]:
-                image, move = _image(file, line)
+                named, move = _image(line)
+                image = images.get(named)
+                if image is None:
+                    image = images[named] = texture_beside(file, named)
             if name is not None:
                 # Beside an image most programs write a grey that none of them multiplies by.
                 plain = image is None or image.data is None
@@ -170,27 +174,27 @@ def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
     return found
 
 
-def _image(file: pathlib.Path, line: str) -> tuple[Texture, Move | None]:
+def _image(line: str) -> tuple[str, Move | None]:
     """What `map_Kd` names, and how its options move coordinates; names may have spaces."""
     rest = _rest(line)
+    words = rest.split()
     told = {"s": [1.0, 1.0], "o": [0.0, 0.0]}
-    while rest.startswith("-"):
-        option, *words = rest.split()
-        key = option[1:].lower()
-        skipped = _OPTIONS.get(key, 0)
-        for k, word in enumerate(words[: _NUMBERS.get(key, 0)]):
+    at = 0
+    while words[at].startswith("-"):
+        key = words[at][1:].lower()
+        after = at + 1 + _OPTIONS.get(key, 0)
+        for k, word in enumerate(words[after : after + _NUMBERS.get(key, 0)]):
             try:
                 value = float(word)
             except ValueError:
                 break
-            skipped += 1
+            after += 1
             if key in told and k < 2:
                 told[key][k] = value
-        left = rest.split(None, 1 + skipped)
-        if len(left) <= 1 + skipped:
+        if after >= len(words):
             break
-        rest = left[-1]
-    return texture_beside(file, rest), make_move(told["s"], told["o"])
+        at = after
+    return rest.split(None, at)[-1], make_move(told["s"], told["o"])
 
 
 def _rest(line: str) -> str:

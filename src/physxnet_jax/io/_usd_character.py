@@ -91,12 +91,18 @@ def _read_moving(path: pathlib.Path) -> tuple[list[Moving], float | None, str | 
     stage = _opened(path)
     start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     rate = stage.GetTimeCodesPerSecond() or 24.0
-    if not (np.isfinite([start, end, rate]).all() and 0 <= end - start < _FRAMES and rate > 0):
+    if not (np.isfinite([start, end, rate]).all() and 0 <= end - start < _FRAMES and rate >= 1e-3):
         raise FormatError(
             f"{path}: runs from {start} to {end} at {rate} a second, not a"
             f" clip of up to {_FRAMES:,} frames. Set the range of the clip and export again."
         )
     if stage.HasAuthoredTimeCodeRange():
+        # Skinning writes the points of every frame into the stage.
+        meshes = [UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+        points = sum(len(m.GetPointsAttr().Get(start) or ()) for m in meshes)
+        if (end - start + 1) * points * 3.0 > _MOST:
+            frames = int(end - start) + 1
+            raise FormatError(f"{path}: {frames} frames of {points:,} points. Cut the clip.")
         UsdSkel.BakeSkinning(Usd.PrimRange(stage.GetPseudoRoot()))
     parts = _meshes(path, stage, start + np.arange(int(end - start) + 1), bound=False)
     moving = [p for p in parts if np.ptp(p.positions, axis=0).max() > 0] or parts

@@ -1,12 +1,15 @@
-"""A binary USD stage is first read by a process that may fail.
+"""A USD stage is first read by a process that may fail.
 
-Its library believes what a file says of its own lengths: a damaged kilobyte takes
-gigabytes, or the process down.
+Its library believes what a binary file says of its own lengths: a damaged kilobyte takes
+gigabytes, or the process down. So does text that is nested without end or refers to itself.
 """
 
 import pathlib
+import re
 import subprocess
 import sys
+
+import numpy as np
 
 from ..errors import FormatError
 
@@ -14,6 +17,11 @@ from ..errors import FormatError
 _BASE, _PER_BYTE = 1_500_000_000, 20
 # What it may take [s], and for each byte.
 _SECONDS, _SECONDS_PER_BYTE = 20.0, 1e-6
+
+# What composes a stage of others, or of itself several times over.
+_REFERS = re.compile(rb"@|\b(references|inherits|specializes|payload|variantSets?)\b")
+# Brackets within brackets that a stage of plain meshes has at most.
+_DEEPEST = 100
 
 # Everything that could be asked for is read once.
 _TRIAL = """
@@ -33,10 +41,18 @@ for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
 """
 
 
+def _depth(text: bytes) -> int:
+    """How deep brackets lie within each other, those in quotes counted too."""
+    letters = np.frombuffer(text, np.uint8)
+    opening, closing = (np.isin(letters, np.frombuffer(b, np.uint8)) for b in (b"{[(", b"}])"))
+    steps = opening[opening | closing].astype(np.int64) * 2 - 1
+    return int(np.cumsum(steps).max(initial=0))
+
+
 def try_stage(path: pathlib.Path) -> None:
     """Reads a stage in a process of its own with bounded memory and time.
 
-    Text that refers to no other file is left to the reader, which stops where it ends.
+    Plain text, flat and without references, is left to the reader, which stops where it ends.
 
     Where no Python can be started (embedded, or forbidden) nothing is tried.
 
@@ -46,9 +62,9 @@ def try_stage(path: pathlib.Path) -> None:
     """
     if not pathlib.Path(sys.executable or "").name.startswith("python"):
         return
-    with path.open("rb") as file:
-        if file.read(5) == b"#usda" and b"@" not in file.read():
-            return
+    text = path.read_bytes()
+    if text.startswith(b"#usda") and not _REFERS.search(text) and _depth(text) <= _DEEPEST:
+        return
     beside = {path, *path.parent.glob("*.usd*"), *path.parent.glob("*/*.usd*")}
     size = sum(p.stat().st_size for p in beside if p.is_file())
     words = [sys.executable, "-P", "-c", _TRIAL, str(path), str(_BASE + _PER_BYTE * size)]

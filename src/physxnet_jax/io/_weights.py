@@ -144,7 +144,7 @@ def read_card(weights: str | pathlib.Path = DEFAULT) -> dict[str, Any]:
     path = _folder(weights) / _CARD
     try:
         card = json.loads(path.read_text())
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise WeightsError(f"{path}: not a card ({error}). Reinstall or copy it again.") from None
     if not isinstance(card, dict):
         raise WeightsError(f"{path}: not a card. Reinstall or copy it again.")
@@ -152,10 +152,16 @@ def read_card(weights: str | pathlib.Path = DEFAULT) -> dict[str, Any]:
 
 
 def weights_size(weights: str | pathlib.Path = DEFAULT) -> int:
-    """Bytes of a network's tensors on disk."""
+    """Bytes of a network's tensors on disk.
+
+    Raises:
+        WeightsError: Unknown name, a card that isn't one, or no tensors beside it.
+    """
     folder = _folder(weights)
-    parts = _parts(read_card(weights))
-    return sum((f / _TENSORS).stat().st_size for f in parts or [folder])
+    files = [f / _TENSORS for f in _parts(read_card(weights)) or [folder]]
+    if missing := [f for f in files if not f.is_file()]:
+        raise WeightsError(f"{missing[0]}: no such file. Reinstall or copy it again.")
+    return sum(f.stat().st_size for f in files)
 
 
 def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
@@ -174,9 +180,7 @@ def load_predictor(weights: str | pathlib.Path = DEFAULT) -> Predictor:
     """
     folder = _folder(weights)
     try:
-        # Numbers of a file, wherever they are asked for: inside a traced function too.
-        with jax.ensure_compile_time_eval():
-            predictor = _load(weights, folder)
+        predictor = _load(weights, folder)
     except WeightsError:
         raise
     # A damaged card may hold anything anywhere; safetensors has errors of its own.
@@ -214,7 +218,9 @@ def _model(card: dict[str, Any]) -> ModelConfig:
 
 def _parts(card: dict[str, Any]) -> list[pathlib.Path]:
     """Folders of the packaged networks whose answers are averaged; mostly none."""
-    return [_PACKAGED / name for name in card.get("mean_of", ()) if name in list_weights()]
+    told = card.get("mean_of", ())
+    named = told if isinstance(told, list) else []
+    return [_PACKAGED / name for name in named if name in list_weights()]
 
 
 def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
@@ -244,16 +250,31 @@ def _load(weights: str | pathlib.Path, folder: pathlib.Path) -> Predictor:
             f"{weights}: the card speaks of {model.resolution} texels a side, width"
             f" {model.width}, {inputs.frames} frames. Copy it again."
         )
+    # Shapes alone, and before anything is evaluated: drawing random parameters only to
+    # replace them takes seconds.
+    network = nnx.eval_shape(lambda: make_generator(model))
+    network.eval()
+    graph, state = nnx.split(network)
+    # Numbers of a file, wherever they are asked for: inside a traced function too.
+    with jax.ensure_compile_time_eval():
+        return _filled(weights, card, model, tensors, graph, state)
+
+
+def _filled(
+    weights: str | pathlib.Path,
+    card: dict[str, Any],
+    model: ModelConfig,
+    tensors: dict[str, np.ndarray],
+    graph: Any,
+    state: Any,
+) -> Predictor:
+    """A network's structure with the numbers of its file."""
     atlas = make_atlas(model.resolution)
     if atlas.digest() != card["atlas"]:
         raise WeightsError(
             f"{weights}: trained on atlas {card['atlas']}, this version makes"
             f" {atlas.digest()}. Use the package version that the weights came with."
         )
-    # Shapes alone: drawing random parameters only to replace them takes seconds.
-    network = nnx.eval_shape(lambda: make_generator(model))
-    network.eval()
-    graph, state = nnx.split(network)
     like, structure = jax.tree.flatten(state)
     leaves = []
     for parameter, y in zip(_parameters(state), like, strict=True):

@@ -45,7 +45,7 @@ class Generator(nnx.Module):
     Only the decoders asked for are computed.
 
     Args:
-        channels: Input channels (18 for `paper`, 21 for `local`).
+        channels: Input channels (18 for `paper`, 24 for `local`).
         templates: Templates to have a decoder for.
         width: Channels of the first layer; doubled at each of four levels.
         rngs: Randomness for the parameters.

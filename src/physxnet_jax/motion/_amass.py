@@ -8,7 +8,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
-from ._source import MAX_JOINT_FRAMES, SourceClip
+from ._source import MAX_JOINT_FRAMES, SourceClip, is_real
 
 AMASS_ARRAYS = (
     "trans",
@@ -20,6 +20,9 @@ AMASS_ARRAYS = (
     "fps",
 )
 """Arrays that are read; shapes, genders and soft tissues are not."""
+
+# A rotation vector longer than this is no pose [rad].
+_MOST_TURN = 1e6
 
 # Joint, its parent, and where it is from there on a person of ordinary build [m].
 _FIGURE: tuple[tuple[str, str | None, tuple[float, float, float]], ...] = (
@@ -76,6 +79,8 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
         parts = (arrays["root_orient"], arrays["pose_body"])
         if any(p.ndim != 2 or len(p) != len(parts[0]) for p in parts):
             raise _broken(path, f"root_orient {parts[0].shape}, pose_body {parts[1].shape}")
+        if not all(map(is_real, parts)):
+            raise _broken(path, f"root_orient {parts[0].dtype}, pose_body {parts[1].dtype}")
         poses = np.concatenate(parts, axis=1)
     if poses is None:
         raise _broken(path, "it has trans, but no poses")
@@ -87,16 +92,16 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
         raise _broken(path, "no frame")
     if len(poses) * joints > MAX_JOINT_FRAMES:
         raise _broken(path, f"{len(poses):,} frames: cut the clip")
-    if any(a.dtype.kind not in "fiu" for a in (poses, trans)):
+    if not (is_real(poses) and is_real(trans)):
         raise _broken(path, f"poses are {poses.dtype}, trans {trans.dtype}")
     turns = poses[:, : 3 * joints].astype(np.float64)
     place = trans.astype(np.float64)
-    bad = ~(np.isfinite(turns).all(axis=1) & np.isfinite(place).all(axis=1))
+    bad = ~((np.abs(turns) < _MOST_TURN).all(axis=1) & np.isfinite(place).all(axis=1))
     if bad.any():
         raise MotionError.at(
             path,
             None,
-            f"frame {int(np.argmax(bad))} is not finite",
+            f"frame {int(np.argmax(bad))} is not finite, or turns on and on",
             "Cut the frame out or interpolate over it",
         )
     names = tuple(name for name, _, _ in _FIGURE)

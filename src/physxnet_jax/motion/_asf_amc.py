@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
+from ..files import is_file
 from ._source import MAX_JOINT_FRAMES, SourceClip
 from ._text import is_count, numbers, read_lines
 
@@ -36,7 +37,7 @@ def find_skeleton(path: pathlib.Path) -> pathlib.Path:
     for stem in stems:
         for suffix in (".asf", ".ASF"):
             candidate = path.with_name(stem + suffix)
-            if stem and candidate.is_file():
+            if stem and is_file(candidate):
                 return candidate
     found = sorted(path.parent.glob("*.asf"))
     if len(found) == 1:

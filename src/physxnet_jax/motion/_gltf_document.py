@@ -5,6 +5,7 @@ import warnings
 from typing import Any
 
 from ..errors import MissingDependencyError, MotionError
+from ..files import is_file
 
 MAX_BYTES = 1_000_000_000
 """Size of a file that is read at most."""
@@ -26,7 +27,7 @@ def parse_gltf(path: pathlib.Path) -> Any:
         raise MissingDependencyError(
             "Reading glTF needs pygltflib: pip install 'physxnet-jax[gltf]'."
         ) from error
-    if not path.is_file():
+    if not is_file(path):
         raise MotionError.at(path, None, "no such file", "Check the path")
     if path.stat().st_size > MAX_BYTES:
         raise MotionError.at(path, None, "over 1 GB", "Cut the clip into shorter files")

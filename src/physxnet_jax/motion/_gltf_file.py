@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
+from ..files import is_file
 from ._gltf_document import MAX_BYTES, parse_gltf
 from ._gltf_track import track_at
 from ._source import nominal_rate
@@ -23,6 +24,8 @@ _MOST_NODE_FRAMES = 1.2e7
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _LENGTHS = {"translation": 3, "rotation": 4, "scale": 3}
+_FARTHEST = 1e12
+_Track = tuple[np.ndarray, np.ndarray, str]
 # Where VRM says which node is which bone: of a person, of a clip, and its version 0.
 _HUMANOID = ("VRMC_vrm", "VRMC_vrm_animation", "VRM")
 
@@ -52,10 +55,12 @@ class GltfFile:
     def __init__(self, path: str | pathlib.Path) -> None:
         self.path = pathlib.Path(path)
         self._buffers: dict[int, bytes] = {}
+        self._keys: dict[int, dict[tuple[int, str], _Track]] = {}
+        self._images: dict[int, tuple[str, bytes | None]] = {}
         self.document = parse_gltf(self.path)
         nodes = self.document.nodes
         if not nodes or len(nodes) > _MAX_NODES:
-            raise self.broken(f"{len(nodes)} nodes")
+            raise self.broken(f"{len(nodes or ())} nodes")
         self.parents = np.full(len(nodes), -1)
         for n, node in enumerate(nodes):
             for child in node.children or ():
@@ -131,7 +136,7 @@ class GltfFile:
         }
         if told.matrix is not None:
             m = np.array(told.matrix, float)
-            if m.shape != (16,) or not np.isfinite(m).all():
+            if m.shape != (16,) or not (np.abs(m) < _FARTHEST).all():
                 raise self.broken(f"the matrix of node {node}")
             m = m.reshape(4, 4).T
             scale = np.linalg.norm(m[:3, :3], axis=0)
@@ -142,7 +147,7 @@ class GltfFile:
             turn = Rotation.from_matrix(m[:3, :3] / scale).as_quat()
             out = {"translation": m[:3, 3], "rotation": turn, "scale": scale}
         if any(
-            out[k].shape != (_LENGTHS[k],) or not np.isfinite(out[k]).all() for k in out
+            out[k].shape != (_LENGTHS[k],) or not (np.abs(out[k]) < _FARTHEST).all() for k in out
         ) or not np.linalg.norm(out["rotation"]):
             raise self.broken(f"the place of node {node}")
         return out
@@ -161,7 +166,7 @@ class GltfFile:
         out = np.zeros((len(at), len(self.parents), 4, 4))
         for n in self.order:
             place = {k: np.tile(v, (len(at), 1)) for k, v in self.local(n).items()}
-            for kind in place.keys() & {k for m, k in tracks if m == n}:
+            for kind in (k for k in _LENGTHS if (n, k) in tracks):
                 keys, values, mode = tracks[n, kind]
                 place[kind] = track_at(keys, values, mode, at, kind)
             self._put(out, n, Rotation.from_quat(place["rotation"]).as_matrix(), place)
@@ -198,7 +203,10 @@ class GltfFile:
         m[:, :3, 3] = place["translation"]
         m[:, 3, 3] = 1.0
         parent = self.parents[n]
-        out[:, n] = m if parent < 0 else out[:, parent] @ m
+        with np.errstate(all="ignore"):
+            out[:, n] = m if parent < 0 else out[:, parent] @ m
+        if not (np.abs(out[:, n]) < _FARTHEST).all():
+            raise self.broken(f"node {n} is nowhere near")
 
     def frame_times(
         self, animation: int = 0, *, rate: float | None = None
@@ -241,7 +249,13 @@ class GltfFile:
             )
         return np.array([float(keys[0][0]) if keys else 0.0]), rate or 30.0
 
-    def _tracks(self, animation: int) -> dict[tuple[int, str], tuple[np.ndarray, np.ndarray, str]]:
+    def _tracks(self, animation: int) -> dict[tuple[int, str], _Track]:
+        """Times, values and mode of all that an animation moves, read once."""
+        if animation not in self._keys:
+            self._keys[animation] = self._read_tracks(animation)
+        return self._keys[animation]
+
+    def _read_tracks(self, animation: int) -> dict[tuple[int, str], _Track]:
         document = self.document
         if not document.animations:
             return {}
@@ -265,7 +279,7 @@ class GltfFile:
                 times.ndim != 1
                 or values.ndim != 2
                 or values.shape != (rows, _LENGTHS.get(kind, values.shape[1]))
-                or not (np.isfinite(times).all() and np.isfinite(values).all())
+                or not ((np.abs(times) < _FARTHEST).all() and (np.abs(values) < _FARTHEST).all())
                 or (np.diff(times) < 0).any()
             ):
                 raise self.broken(f"the keys of node {node}, {kind}")
@@ -288,10 +302,16 @@ class GltfFile:
 
     def image(self, texture: object) -> tuple[str, bytes | None]:
         """Name and file of a texture's image; no file where it isn't beside this one."""
-        document = self.document
-        source = document.textures[self.index(texture, document.textures, "texture")].source
+        textures = self.document.textures
+        source = textures[self.index(texture, textures, "texture")].source
         if source is None:
             return f"texture{texture}", None
+        if source not in self._images:
+            self._images[source] = self._read_image(source)
+        return self._images[source]
+
+    def _read_image(self, source: object) -> tuple[str, bytes | None]:
+        document = self.document
         told = document.images[self.index(source, document.images, "image")]
         name = str(told.name or told.uri or f"image{source}")[:200]
         if told.bufferView is not None:
@@ -341,7 +361,7 @@ class GltfFile:
                 f"its buffer '{uri[:60]}' is outside its folder",
                 "Put it beside the file, or export a .glb; nothing else is opened",
             )
-        if not file.is_file() or file.stat().st_size > MAX_BYTES:
+        if not is_file(file) or file.stat().st_size > MAX_BYTES:
             raise MotionError.at(
                 self.path,
                 None,

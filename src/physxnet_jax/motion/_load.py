@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..body import Body
 from ..errors import MotionError
-from ..files import read_arrays, whole_file
+from ..files import is_file, read_arrays, whole_file
 from ._amass import AMASS_ARRAYS, amass_clip
 from ._asf_amc import read_amc
 from ._bvh import read_bvh
@@ -20,7 +20,7 @@ from ._motion import Motion, make_motion, resample
 from ._procedural import CLIPS, procedural_clip
 from ._retarget import retarget
 from ._skeletons import read_joint_map
-from ._source import SourceClip
+from ._source import SourceClip, is_real
 
 
 def load_motion(
@@ -148,7 +148,7 @@ def save_motion(path: str | pathlib.Path, motion: Motion) -> None:
 
 
 def _read_npz(path: pathlib.Path) -> Motion | SourceClip:
-    if not path.is_file():
+    if not is_file(path):
         raise MotionError.at(path, None, "no such file", "Check the path")
     try:
         data = read_arrays(path, ("rotations", "root", "fps", *AMASS_ARRAYS))
@@ -158,6 +158,8 @@ def _read_npz(path: pathlib.Path) -> Motion | SourceClip:
         return amass_clip(data, path)
     if not {"rotations", "root", "fps"} <= data.keys() or data["fps"].size != 1:
         raise _not_motion(path, f"it holds {', '.join(sorted(data)) or 'nothing known'}")
+    if not all(is_real(data[k]) for k in ("rotations", "root", "fps")):
+        raise _not_motion(path, ", ".join(f"{k} of {x.dtype}" for k, x in data.items()))
     try:
         rate = float(data["fps"].reshape(()))
         return make_motion(data["rotations"], data["root"], rate, name=path.stem)

@@ -1,6 +1,7 @@
 """Motion of the body: joint rotations, root position and frame rate."""
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,9 +42,7 @@ class Motion:
         return self.root.shape[0]
 
 
-def make_motion(
-    rotations: object, root: object, fps: float | int, *, name: str = "motion"
-) -> Motion:
+def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "motion") -> Motion:
     """A `Motion` from host arrays, checked and normalised.
 
     Args:
@@ -56,17 +55,20 @@ def make_motion(
         MotionError: Wrong shapes, no frame, a rate that isn't positive, a value that
             isn't finite, or a zero quaternion. The text names the frame and joint.
     """
-    r = np.asarray(rotations, dtype=np.float64)
-    p = np.asarray(root, dtype=np.float64)
-    # Beyond this the cast to float32 would leave no millimetres.
-    p = np.where(np.abs(p) < _FARTHEST, p, np.nan)
-    if r.ndim != 3 or r.shape[2] != 4 or p.shape != (len(r), 3) or len(r) == 0:
+    # Before anything is copied: an archive of kilobytes may hold gigabytes of zeros.
+    shape, places = np.shape(rotations), np.shape(root)
+    if len(shape) != 3 or shape[2] != 4 or places != (shape[0], 3) or shape[0] == 0:
         raise MotionError(
-            f"{name}: rotations {r.shape} and root {p.shape}, expected"
+            f"{name}: rotations {shape} and root {places}, expected"
             " [frames, joints, 4] and [frames, 3] with at least one frame."
         )
     if not (np.isfinite(fps) and fps > 0):
         raise MotionError(f"{name}: fps is {fps}, expected a positive number.")
+    if shape[0] * shape[1] > MAX_JOINT_FRAMES:
+        raise MotionError(f"{name}: {shape[0]:,} frames of {shape[1]:,} joints. Cut the clip.")
+    r, p = (np.asarray(x, dtype=np.float64) for x in (rotations, root))
+    # Beyond this the cast to float32 would leave no millimetres.
+    p = np.where(np.abs(p) < _FARTHEST, p, np.nan)
     bad = ~np.isfinite(r).all(axis=2)
     bad_root = ~np.isfinite(p).all(axis=1)
     if bad.any() or bad_root.any():
@@ -77,14 +79,15 @@ def make_motion(
             f"{name}: frame {frame}, joint {joint} is not finite or over"
             " 100 km away. Cut the frame out or interpolate over it."
         )
-    length = np.linalg.norm(r, axis=2, keepdims=True)
-    if (length < 1e-6).any():
-        frame, joint, _ = (int(x) for x in np.argwhere(length < 1e-6)[0])
+    largest = np.abs(r).max(axis=2, keepdims=True)
+    if (largest < 1e-6).any():
+        frame, joint, _ = (int(x) for x in np.argwhere(largest < 1e-6)[0])
         raise MotionError(
             f"{name}: frame {frame}, joint {joint} has a zero quaternion; use"
             " (1, 0, 0, 0) for no rotation."
         )
-    r = r / length
+    r = r / largest
+    r = r / np.linalg.norm(r, axis=2, keepdims=True)
     return Motion(
         jnp.asarray(r.astype(np.float32)),
         jnp.asarray(p.astype(np.float32)),

@@ -13,7 +13,7 @@ from ._source import SourceClip
 
 _BOTH = ("Left", "Right")
 # Bones shorter or longer than this have no direction that can be computed with.
-_SHORTEST, _LONGEST = 1e-9, 1e9
+SHORTEST, LONGEST = 1e-9, 1e9
 # At rest a skeleton stands if its legs and trunk lean less than 45 degrees.
 _STANDING = float(np.cos(np.radians(45.0)))
 # DAZ figures hold their forearms 17 degrees forward in their T-pose.
@@ -94,7 +94,7 @@ def _heading(
     left = positions[index["LeftUpLeg"]] - positions[index["RightUpLeg"]]
     left = left * [1.0, 0.0, 1.0]
     size = np.linalg.norm(left)
-    if not _SHORTEST < size < _LONGEST or left[0] > _STANDING * size:
+    if not SHORTEST < size < LONGEST or left[0] > _STANDING * size:
         return np.eye(3)
     left, up = left / size, np.array([0.0, 1.0, 0.0])
     return np.stack([left, up, np.cross(left, up)], axis=1)
@@ -128,7 +128,7 @@ def _stance(source: SourceClip, frame: int, index: Mapping[str, int]) -> Float[n
     left = positions[index["LeftUpLeg"]] - positions[index["RightUpLeg"]]
     up = _trunk(positions, index)
     size, high = np.linalg.norm(left), np.linalg.norm(up)
-    if not (_SHORTEST < size < _LONGEST and _SHORTEST < high < _LONGEST):
+    if not (SHORTEST < size < LONGEST and SHORTEST < high < LONGEST):
         raise _no_trunk(source)
     left, up = left / size, up / high
     left = left - (left @ up) * up
@@ -177,7 +177,7 @@ def limb_directions(
     for a, b in LIMBS.items():
         d = position[index[b]] - position[index[a]]
         length = float(np.linalg.norm(d))
-        if not _SHORTEST < length < _LONGEST:
+        if not SHORTEST < length < LONGEST:
             raise MotionError.at(
                 source.path,
                 None,

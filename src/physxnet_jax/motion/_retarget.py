@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..body import NUM_BODY_VERTICES, Body, align_global, load_body
 from ..errors import MotionError
 from ._motion import Motion, animate, make_motion
-from ._reference import limb_directions, reference_pose, upright
+from ._reference import LONGEST, SHORTEST, limb_directions, reference_pose, upright
 from ._skeletons import NEEDED, find_joint_map, nearest_joint_map
 from ._source import SourceClip
 
@@ -65,7 +65,15 @@ def retarget(
     heads = np.asarray(body.joint_positions(rest)[0], dtype=np.float64)
     at = body.joint_names.index
     positions = source.positions()[start:]
-    scale = leg_length(heads, at) / leg_length(positions[0], index.__getitem__)
+    legs = leg_length(positions[0], index.__getitem__)
+    if not SHORTEST < legs < LONGEST:
+        raise MotionError.at(
+            source.path,
+            None,
+            f"legs {legs:.3g} units long in its first frame",
+            "Export it again, or map other joints",
+        )
+    scale = leg_length(heads, at) / legs
     hips = [index["LeftUpLeg"], index["RightUpLeg"]]
     middle = 0.5 * (heads[at("LeftUpLeg")] + heads[at("RightUpLeg")]) - heads[0]
     root = scale * positions[:, hips].mean(axis=1) - world[:, 0] @ middle

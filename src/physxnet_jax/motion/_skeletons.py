@@ -211,7 +211,10 @@ def read_joint_map(path: str | pathlib.Path) -> dict[str, str]:
         if path.stat().st_size > 1_000_000:
             raise MotionError.at(path, None, "over 1 MB", "A joint map is a page of names")
         joints = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    # TOMLDecodeError is one of ValueError; so are names and numbers that Python refuses.
+    except (OSError, ValueError, RecursionError) as error:
+        if isinstance(error, MotionError):
+            raise
         raise MotionError.at(
             path, None, f"not a joint map ({error})", 'Write lines like Hips = "pelvis"'
         ) from None

@@ -5,9 +5,12 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-MAX_JOINT_FRAMES = 5e7
-"""Frames times joints that a clip may have: an hour at 120 fps of a hundred joints."""
+from ..errors import MotionError
 
+MAX_JOINT_FRAMES = 6e6
+"""Frames times joints that a clip may have: eleven minutes at 120 fps of 75 joints."""
+
+_FARTHEST = 1e9
 _BROADCAST = tuple(k * 1000.0 / 1001.0 for k in (24, 30, 48, 60, 120))
 
 
@@ -22,6 +25,11 @@ def nominal_rate(fps: float) -> float:
     """
     nearest = min((float(round(fps)), *_BROADCAST), key=lambda r: abs(r - fps))
     return nearest if nearest > 0 and abs(nearest - fps) < 0.05 else fps
+
+
+def is_real(values: np.ndarray) -> bool:
+    """Whether an array of a file holds plain numbers, which float64 can hold."""
+    return values.dtype.kind in "fiu" and values.dtype.itemsize <= 8
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,6 +49,9 @@ class SourceClip:
             [joints, 3, 3]; no rotation at all if omitted.
         shifts: Position of every joint in its parent's frame where it changes, shape
             [frames, joints, 3]; `offsets` all the time if omitted.
+
+    Raises:
+        MotionError: Places that no skeleton has in any unit.
     """
 
     names: tuple[str, ...]
@@ -53,6 +64,17 @@ class SourceClip:
     path: str
     rest: Float[np.ndarray, "joints 3 3"] | None = None
     shifts: Float[np.ndarray, "frames joints 3"] | None = None
+
+    def __post_init__(self) -> None:
+        # Sums of what is farther away keep no digit of a limb.
+        for x in (self.offsets, self.root, self.shifts):
+            if x is not None and (np.abs(x) > _FARTHEST).any():
+                raise MotionError.at(
+                    self.path,
+                    None,
+                    f"joints {float(np.abs(x).max()):.3g} units away from each other",
+                    "Export it again",
+                )
 
     def positions(self) -> Float[np.ndarray, "frames joints 3"]:
         """World positions of all joints."""

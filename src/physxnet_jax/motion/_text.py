@@ -4,7 +4,10 @@ import math
 import pathlib
 
 from ..errors import MotionError
+from ..files import is_file
 
+# No length in any unit, and no angle.
+_LARGEST = 1e12
 # Ten minutes at 120 fps of 30 joints is 60 MB as text.
 _MAX_BYTES = 512_000_000
 
@@ -15,7 +18,7 @@ def read_lines(path: pathlib.Path, kind: str) -> list[str]:
     Raises:
         MotionError: Missing, empty, binary or absurdly large.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise MotionError.at(path, None, "no such file", "Check the path")
     if path.stat().st_size > _MAX_BYTES:
         raise MotionError.at(path, None, "over 500 MB of text", "Cut the clip into shorter files")
@@ -31,9 +34,12 @@ def read_lines(path: pathlib.Path, kind: str) -> list[str]:
             f"Convert it to {kind} text first (FBX and C3D are not read)",
         )
     try:
-        return blob.decode("utf-8-sig").splitlines()
+        lines = blob.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
-        return blob.decode("latin-1").splitlines()
+        lines = blob.decode("latin-1").splitlines()
+    if not any(map(str.strip, lines)):
+        raise MotionError.at(path, None, "the file is empty", f"Export the {kind} again")
+    return lines
 
 
 def is_count(word: str) -> bool:
@@ -45,27 +51,28 @@ def numbers(path: pathlib.Path, line: int, words: list[str]) -> list[float]:
     """Finite numbers of one line.
 
     Raises:
-        MotionError: A word that isn't a number, or NaN or infinity.
+        MotionError: A word that isn't a number, or NaN, infinity or one beyond any measure.
     """
     # Files hold millions: the words are looked at one by one only where something is wrong.
     try:
         out = list(map(float, words))
     except ValueError:
         out = []
-    if len(out) == len(words) and all(map(math.isfinite, out)):
+    if len(out) == len(words) and all(-_LARGEST <= x <= _LARGEST for x in out):
         return out
     for word in words:
         try:
-            finite = math.isfinite(float(word))
+            value = float(word)
         except ValueError:
             raise MotionError.at(
                 path, line, f"'{word[:40]}' is not a number", "Export the clip again"
             ) from None
-        if not finite:
+        if not abs(value) <= _LARGEST:
             raise MotionError.at(
                 path,
                 line,
-                f"the value '{word[:40]}' is not finite",
+                f"the value '{word[:40]}' is "
+                + ("beyond any measure" if math.isfinite(value) else "not finite"),
                 "Cut this frame out or interpolate over it",
             )
     return out

@@ -13,6 +13,7 @@ from ._effect import (
 from ._implicit import Implicit as Implicit
 from ._rollout import (
     ACCURACY as ACCURACY,
+    ROLLOUT_BLOCK as ROLLOUT_BLOCK,
     lead_in as lead_in,
     simulate as simulate,
     simulate_batch as simulate_batch,

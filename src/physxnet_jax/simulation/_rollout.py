@@ -21,7 +21,7 @@ from ._solver import Solver
 from ._xpbd import XPBD
 
 # Frames compiled together: clips of any length are cut into blocks of this many.
-_BLOCK = 10
+ROLLOUT_BLOCK = 10
 
 
 def lead_in(body: Body, motion: Motion, *, seconds: float = 1.5, settle: float = 0.4) -> Motion:
@@ -167,7 +167,7 @@ def _roll(
     leads = [lead_in(body, m) for m in motions]
     skipped = leads[0].num_frames
     longest = max(m.num_frames for m in motions)
-    total = -(-(skipped + longest - 1) // _BLOCK) * _BLOCK + 1
+    total = -(-(skipped + longest - 1) // ROLLOUT_BLOCK) * ROLLOUT_BLOCK + 1
 
     def stack(name: str) -> np.ndarray:
         rows = []
@@ -199,8 +199,8 @@ def _roll(
         key = fingerprint(system, rotations, root, (solver, energies))
         store = Resume(resume, key)
         state, positions, diagnostics = store.load(state)
-    for at in range(_BLOCK * len(positions), total - 1, _BLOCK):
-        part = slice(at, at + _BLOCK + 1)
+    for at in range(ROLLOUT_BLOCK * len(positions), total - 1, ROLLOUT_BLOCK):
+        part = slice(at, at + ROLLOUT_BLOCK + 1)
         state, moved, info = advance(
             system,
             state,
@@ -216,7 +216,7 @@ def _roll(
         if store is not None:
             store.save(len(positions) - 1, state, positions[-1], diagnostics[-1])
         if progress is not None:
-            progress(min(at + _BLOCK, total - 1), total - 1)
+            progress(min(at + ROLLOUT_BLOCK, total - 1), total - 1)
     if store is not None:
         store.finish()
     # Diagnostics start at frame 1: the rest state has none, so the lead-in covers it.

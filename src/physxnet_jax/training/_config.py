@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Literal
 
+from ..errors import check_counts, check_numbers
 from ..models import ModelConfig
 
 
@@ -74,6 +75,12 @@ class TrainConfig:
     max_skipped: int = 20
 
     def __post_init__(self) -> None:
+        check_counts(self, "epochs", "batch", "discriminator_width", "validate_every")
+        check_counts(self, "patience", "checkpoint_every", "max_skipped")
+        check_numbers(self, "learning_rate", "discriminator_rate", "kernel_rate")
+        check_numbers(self, "l1_weight", zero=True)
+        if not 0.0 <= self.momentum < 1.0:
+            raise ValueError(f"momentum is {self.momentum}; it lies from 0 to below 1.")
         if not 0.0 <= self.vertex_share <= 1.0:
             raise ValueError(f"vertex_share is {self.vertex_share}; it is a share, 0 to 1.")
         if self.vertex_share and self.model.family != "local":

@@ -15,7 +15,7 @@ from flax import nnx
 from ..body import load_body
 from ..data import Sequence, mirrored_sequence
 from ..errors import FormatError, PhysXNetError
-from ..files import whole_file
+from ..files import append_line, whole_file
 from ..garment import template
 from ..geometry import mesh_edges
 from ..models import ModelConfig, Normalisation, Predictor, Surface, make_surface, make_wearable
@@ -111,46 +111,41 @@ def train(
     key = jax.random.key(config.seed)
     board = Board(folder)
     began = time.perf_counter()
+
+    def note(values: dict[str, float]) -> None:
+        values |= {"step": done, "seconds": round(time.perf_counter() - began, 3)}
+        append_line(folder / METRICS, values)
+        board.write(values, done)
+        if report is not None:
+            report(done, stop, values)
+
     try:
-        with (folder / METRICS).open("a") as log:
-            # A line that a kill cut short ends here, or the next would be lost with it.
-            if log.tell() and not (folder / METRICS).read_bytes().endswith(b"\n"):
-                log.write("\n")
-
-            def note(values: dict[str, float]) -> None:
-                values |= {"step": done, "seconds": round(time.perf_counter() - began, 3)}
-                log.write(json.dumps(values) + "\n")
-                log.flush()
-                board.write(values, done)
-                if report is not None:
-                    report(done, stop, values)
-
-            while done < stop and not watch.exhausted:
-                index = batch_indices(len(frames), config.batch, config.seed, done)
-                state, metrics = run.step(state, take(frames, index), jax.random.fold_in(key, done))
-                done += 1
-                skipped = max(
-                    int(state.generator_opt.notfinite_count),
-                    int(state.discriminator_opt.notfinite_count),
+        while done < stop and not watch.exhausted:
+            index = batch_indices(len(frames), config.batch, config.seed, done)
+            state, metrics = run.step(state, take(frames, index), jax.random.fold_in(key, done))
+            done += 1
+            skipped = max(
+                int(state.generator_opt.notfinite_count),
+                int(state.discriminator_opt.notfinite_count),
+            )
+            if skipped >= config.max_skipped:
+                raise PhysXNetError(
+                    f"step {done}: {skipped} updates in a row were not finite. Lower the"
+                    " learning rate or look for NaN in the data."
                 )
-                if skipped >= config.max_skipped:
-                    raise PhysXNetError(
-                        f"step {done}: {skipped} updates in a row were not finite. Lower the"
-                        " learning rate or look for NaN in the data."
-                    )
-                last = done == stop
-                if done % 20 == 0 or last:
-                    values = {k: float(v) for k, v in metrics.items()}
-                    note(values | players.update(values))
-                # On schedule alone: a run that is stopped on the way has to be the same run.
-                if unseen is not None and (done % config.validate_every == 0 or done == total):
-                    losses, shown = _validate(config, run, state, unseen)
-                    if watch.update(losses["validation_mm"]):
-                        best_kept.save(state, {"step": done, **losses})
-                    note(losses)
-                    board.show(shown, done)
-                if done % config.checkpoint_every == 0:
-                    checkpoints.save(state, {"step": done})
+            last = done == stop
+            if done % 20 == 0 or last:
+                values = {k: float(v) for k, v in metrics.items()}
+                note(values | players.update(values))
+            # On schedule alone: a run that is stopped on the way has to be the same run.
+            if unseen is not None and (done % config.validate_every == 0 or done == total):
+                losses, shown = _validate(config, run, state, unseen)
+                if watch.update(losses["validation_mm"]):
+                    best_kept.save(state, {"step": done, **losses})
+                note(losses)
+                board.show(shown, done)
+            if done % config.checkpoint_every == 0:
+                checkpoints.save(state, {"step": done})
     finally:
         board.close()
         if restored is None or int(restored.step) != int(state.step):

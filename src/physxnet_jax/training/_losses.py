@@ -19,6 +19,10 @@ def soft_labels(
         real: Which kind.
         flip: Share of labels that take the other kind's value.
 
+    Note (differs from the paper):
+        Labels of patches are swapped, others in every step; the paper swaps as many of
+        the frames, for an epoch.
+
     References:
         PhysXNet, section 5.1.
     """

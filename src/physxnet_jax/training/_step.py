@@ -1,6 +1,5 @@
-"""One training step: discriminator, then generator, as one jitted function."""
+"""One training step: generator, then discriminator on the same maps, as one jitted function."""
 
-import contextlib
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import nnx
-from jaxtyping import Array, Key
+from jaxtyping import Array, Float, Key
 
 from ..data import QUANTUM
 from ..models import (
@@ -47,7 +46,7 @@ class TrainState:
     Attributes:
         generator: Parameters of G.
         generator_rest: Its batch statistics.
-        discriminator: Parameters of D (empty without one).
+        discriminator: Parameters of D; empty without one.
         discriminator_rest: Its batch statistics.
         generator_opt: Optimiser state of G.
         discriminator_opt: Optimiser state of D.
@@ -105,82 +104,32 @@ class Steps:
     graph: Any
 
 
-def make_step(
-    config: TrainConfig,
-    atlas: Atlas,
-    surface: Surface,
-    normalisation: Normalisation,
-    tables: dict[str, ClothTables],
-    fps: float,
-    steps: int,
-) -> Steps:
-    """The first state and the functions of a run."""
-    inputs, templates = config.model.inputs, config.model.templates
-    g_graph, g_params, g_rest = nnx.split(
-        make_generator(config.model, seed=config.seed), nnx.Param, ...
-    )
-    judge = Discriminator(
-        inputs.channels + 3 * len(templates),
-        width=config.discriminator_width,
-        rngs=nnx.Rngs(config.seed + 1),
-    )
-    d_graph, d_params, d_rest = nnx.split(judge, nnx.Param, ...)
-    kernel_rate = config.kernel_rate if config.optimiser == "muon" else None
-    g_tx = make_optimiser(config, config.learning_rate, steps, kernel_rate=kernel_rate)
-    d_tx = make_optimiser(config, config.discriminator_rate, steps)
-    state = TrainState(
-        g_params,
-        g_rest,
-        d_params,
-        d_rest,
-        g_tx.init(g_params),
-        d_tx.init(d_params),
-        jnp.zeros((), jnp.int32),
-    )
+@dataclasses.dataclass(frozen=True)
+class _Task:
+    """What is to be learned: maps to see, maps wanted, and how far an answer is from them."""
 
-    dtype = jnp.dtype(config.precision)
+    config: TrainConfig
+    atlas: Atlas
+    surface: Surface
+    normalisation: Normalisation
+    tables: dict[str, ClothTables]
+    fps: float
 
-    def lower(tree: Any) -> Any:
-        return jax.tree.map(lambda v: v.astype(dtype), tree)
-
-    def generate(
-        params: Any, rest: Any, x: Array, training: bool = True
-    ) -> tuple[dict[str, Array], Any]:
-        network = nnx.merge(g_graph, lower(params), rest, copy=True)
-        if training:
-            network.train()
-        else:
-            network.eval()
-        with _mixed():
-            out = network(x.astype(dtype), templates)
-        return {t: m.astype(jnp.float32) for t, m in out.items()}, nnx.state(
-            network, nnx.Not(nnx.Param)
-        )
-
-    def judge_maps(params: Any, rest: Any, x: Array, y: Array) -> tuple[Array, Any]:
-        network = nnx.merge(d_graph, lower(params), rest, copy=True)
-        network.train()
-        with _mixed():
-            out = network(x.astype(dtype), y.astype(dtype))
-        return out.astype(jnp.float32), nnx.state(network, nnx.Not(nnx.Param))
-
-    def stack(maps: dict[str, Array], masks: dict[str, Array]) -> Array:
-        return jnp.concatenate([maps[t] * masks[t] for t in templates], axis=-1)
-
-    def prepare(batch: Batch) -> tuple[Array, dict[str, Array], dict[str, Array]]:
+    def prepare(self, batch: Batch) -> tuple[Array, dict[str, Array], dict[str, Array]]:
         """Motion maps, wanted offsets at texels over their scale, and what counts."""
+        inputs, surface = self.config.model.inputs, self.surface
         features = jax.vmap(clip_features, in_axes=(None, None, 0, 0, None, None))(
             surface.rest,
             surface.weights,
             batch["rotations"],
             batch["translations"],
-            fps,
+            self.fps,
             inputs,
         )
-        x = atlas.to_map(normalise(features[:, 0], normalisation, inputs))
+        x = self.atlas.to_map(normalise(features[:, 0], self.normalisation, inputs))
         targets, masks = {}, {}
-        for t in templates:
-            c = tables[t]
+        for t in self.config.model.templates:
+            c = self.tables[t]
             meters = target_offsets(
                 batch[f"target_{t}"],
                 c.to_cloth,
@@ -192,42 +141,101 @@ def make_step(
                 batch["translations"][:, -1],
                 inputs.family,
             )
-            targets[t] = meters / normalisation.offset[t]
+            targets[t] = meters / self.normalisation.offset[t]
             seen = surface.valid[t].astype(jnp.float32)[None, :, None]
-            weight = batch[f"weight_{t}"][:, None, None]
-            masks[t] = atlas.to_map(seen * weight)
+            masks[t] = self.atlas.to_map(seen * batch[f"weight_{t}"][:, None, None])
         return x, targets, masks
 
-    distance = masked_l2 if config.squared else masked_l1
+    def stack(self, maps: dict[str, Array], masks: dict[str, Array]) -> Array:
+        """All templates' maps as one, where they count: what D judges."""
+        return jnp.concatenate([maps[t] * masks[t] for t in self.config.model.templates], axis=-1)
 
-    def at_vertices(texels: Array, target: Array, name: str, weight: Array, scale: Array) -> Array:
-        """Error of offsets as `dress_frames` reads them, over their scale."""
-        wearable = tables[name].wearable
-        seen = jnp.where(surface.valid[name][None, :, None], texels, 0.0)
-        wanted = target.astype(jnp.float32) * QUANTUM / scale
-        return vertex_loss(
-            wearable.sample(seen), wanted, tables[name].edges, weight, distance, config.edge_share
-        )
+    def mean_error(
+        self, t: str, texels: Array, targets: dict[str, Array], batch: Batch
+    ) -> Float[Array, ""]:
+        """L1 at texels over their scale: what is shown, whatever is minimised."""
+        return masked_l1(texels, targets[t], self.surface.valid[t], batch[f"weight_{t}"])
 
-    def at_texels(
-        maps: Array, texels: Array, target: Array, name: str, weight: Array, mask: Array
-    ) -> Array:
+    def loss(
+        self,
+        t: str,
+        maps: Array,
+        texels: Array,
+        targets: dict[str, Array],
+        masks: dict[str, Array],
+        batch: Batch,
+    ) -> Float[Array, ""]:
+        """What is minimised of a template, but for what D says."""
+        config, target, weight = self.config, targets[t], batch[f"weight_{t}"]
+        distance = masked_l2 if config.squared else masked_l1
         if config.scales == 1:
-            return distance(texels, target, surface.valid[name], weight)
-        return pooled_l1(maps, atlas.to_map(target), mask, config.scales)
+            at_texels = distance(texels, target, self.surface.valid[t], weight)
+        else:
+            at_texels = pooled_l1(maps, self.atlas.to_map(target), masks[t], config.scales)
+        if not config.vertex_share:
+            return at_texels
+        # Of offsets as `dress_frames` reads them, over their scale.
+        seen = jnp.where(self.surface.valid[t][None, :, None], texels, 0.0)
+        stored = batch[f"target_{t}"].astype(jnp.float32) * QUANTUM
+        at_vertices = vertex_loss(
+            self.tables[t].wearable.sample(seen),
+            stored / self.normalisation.offset[t],
+            self.tables[t].edges,
+            weight,
+            distance,
+            config.edge_share,
+        )
+        return (1.0 - config.vertex_share) * at_texels + config.vertex_share * at_vertices
+
+
+def make_step(
+    config: TrainConfig,
+    atlas: Atlas,
+    surface: Surface,
+    normalisation: Normalisation,
+    tables: dict[str, ClothTables],
+    fps: float,
+    steps: int,
+) -> Steps:
+    """The first state and the functions of a run."""
+    task = _Task(config, atlas, surface, normalisation, tables, fps)
+    templates, dtype = config.model.templates, jnp.dtype(config.precision)
+    g_graph, g_params, g_rest = nnx.split(
+        make_generator(config.model, seed=config.seed), nnx.Param, ...
+    )
+    d_graph, d_params, d_rest = None, {}, {}
+    if config.adversarial:
+        judge = Discriminator(
+            config.model.inputs.channels + 3 * len(templates),
+            width=config.discriminator_width,
+            rngs=nnx.Rngs(config.seed + 1),
+        )
+        d_graph, d_params, d_rest = nnx.split(judge, nnx.Param, ...)
+    kernel_rate = config.kernel_rate if config.optimiser == "muon" else None
+    g_tx = make_optimiser(config, config.learning_rate, steps, kernel_rate=kernel_rate)
+    d_tx = make_optimiser(config, config.discriminator_rate, steps)
+    first = TrainState(
+        g_params,
+        g_rest,
+        d_params,
+        d_rest,
+        g_tx.init(g_params),
+        d_tx.init(d_params),
+        jnp.zeros((), jnp.int32),
+    )
 
     @jax.jit
     def look(
         state: TrainState, batch: Batch
     ) -> tuple[dict[str, Array], dict[str, tuple[Array, Array]]]:
-        x, targets, masks = prepare(batch)
-        maps, _ = generate(state.generator, state.generator_rest, x, training=False)
+        x, targets, masks = task.prepare(batch)
+        maps, _ = _ask(
+            g_graph, state.generator, state.generator_rest, x, templates, dtype=dtype, train=False
+        )
         losses, shown = {}, {}
         for t in templates:
             scale = normalisation.offset[t]
-            weight = batch[f"weight_{t}"]
-            l1 = masked_l1(atlas.from_map(maps[t]), targets[t], surface.valid[t], weight)
-            losses[t] = 1e3 * l1 * scale
+            losses[t] = 1e3 * scale * task.mean_error(t, atlas.from_map(maps[t]), targets, batch)
             shown[t] = (maps[t] * masks[t] * scale, atlas.to_map(targets[t]) * masks[t] * scale)
         return losses, shown
 
@@ -235,27 +243,21 @@ def make_step(
     def step(
         state: TrainState, batch: Batch, key: Key[Array, ""]
     ) -> tuple[TrainState, dict[str, Array]]:
-        x, targets, masks = prepare(batch)
-        real = stack({t: atlas.to_map(v) for t, v in targets.items()}, masks)
+        x, targets, masks = task.prepare(batch)
 
         def generator_loss(params: Any) -> tuple[Array, tuple]:
-            maps, rest = generate(params, state.generator_rest, x)
-            total = jnp.zeros(())
-            parts = {}
+            maps, rest = _ask(g_graph, params, state.generator_rest, x, templates, dtype=dtype)
+            total, parts = jnp.zeros(()), {}
             for t in templates:
-                texels, weight = atlas.from_map(maps[t]), batch[f"weight_{t}"]
-                parts[t] = masked_l1(texels, targets[t], surface.valid[t], weight)
-                value = at_texels(maps[t], texels, targets[t], t, weight, masks[t])
-                if config.vertex_share:
-                    read = at_vertices(
-                        texels, batch[f"target_{t}"], t, weight, normalisation.offset[t]
-                    )
-                    value = (1.0 - config.vertex_share) * value + config.vertex_share * read
-                total = total + value / len(templates)
-            fake = stack(maps, masks)
+                texels = atlas.from_map(maps[t])
+                parts[t] = task.mean_error(t, texels, targets, batch)
+                loss = task.loss(t, maps[t], texels, targets, masks, batch)
+                total = total + loss / len(templates)
+            fake = task.stack(maps, masks)
             adv = jnp.zeros(())
             if config.adversarial:
-                logits, _ = judge_maps(state.discriminator, state.discriminator_rest, x, fake)
+                judged = (state.discriminator, state.discriminator_rest)
+                logits, _ = _ask(d_graph, *judged, x, fake, dtype=dtype)
                 adv = adversarial_loss(logits)
             return adv + config.l1_weight * total, (rest, fake, total, adv, parts)
 
@@ -264,56 +266,81 @@ def make_step(
         )(state.generator)
         updates, g_opt = _update(g_tx, grads, state.generator_opt, state.generator)
         g_params = optax.apply_updates(state.generator, updates)
-        ok = jnp.isfinite(loss)
-        g_rest = jax.tree.map(
-            lambda new, old: jnp.where(ok, new, old), g_rest, state.generator_rest
-        )
+        g_rest = _kept(jnp.isfinite(loss), g_rest, state.generator_rest)
         kind = "l2" if config.squared else "l1"
         metrics = {"loss": loss, kind: total, "adversarial": adv}
         metrics |= {f"l1_mm_{t}": 1e3 * parts[t] * normalisation.offset[t] for t in templates}
         metrics["skipped"] = g_opt.total_notfinite  # pyright: ignore[reportAttributeAccessIssue]
-        d_params, d_rest, d_opt = (
-            state.discriminator,
-            state.discriminator_rest,
-            state.discriminator_opt,
-        )
+        judge = (state.discriminator, state.discriminator_rest, state.discriminator_opt)
         if config.adversarial:
-            still = jax.lax.stop_gradient(fake)
-
-            def judge_loss(params: Any) -> tuple[Array, tuple]:
-                real_logits, rest = judge_maps(params, state.discriminator_rest, x, real)
-                fake_logits, rest = judge_maps(params, rest, x, still)
-                k_real, k_fake = jax.random.split(key)
-                value = discriminator_loss(
-                    real_logits,
-                    fake_logits,
-                    soft_labels(k_real, real_logits.shape, real=True),
-                    soft_labels(k_fake, fake_logits.shape, real=False),
-                )
-                right = jnp.mean((real_logits > 0).astype(jnp.float32)) + jnp.mean(
-                    (fake_logits < 0).astype(jnp.float32)
-                )
-                return value, (rest, 0.5 * right)
-
-            (d_loss, (d_rest, accuracy)), d_grads = jax.value_and_grad(judge_loss, has_aux=True)(
-                state.discriminator
+            wanted = {t: atlas.to_map(v) for t, v in targets.items()}
+            judge, told = _teach_judge(
+                d_graph, d_tx, judge, x, task.stack(wanted, masks), fake, key, dtype
             )
-            d_updates, d_opt = _update(d_tx, d_grads, state.discriminator_opt, state.discriminator)
-            d_params = optax.apply_updates(state.discriminator, d_updates)
-            fine = jnp.isfinite(d_loss)
-            d_rest = jax.tree.map(
-                lambda new, old: jnp.where(fine, new, old), d_rest, state.discriminator_rest
-            )
-            metrics |= {"discriminator": d_loss, "discriminator_accuracy": accuracy}
+            metrics |= told
+        d_params, d_rest, d_opt = judge
         new = TrainState(g_params, g_rest, d_params, d_rest, g_opt, d_opt, state.step + 1)
         return new, metrics
 
-    return Steps(state, step, look, g_graph)
+    return Steps(first, step, look, g_graph)
 
 
-def _mixed() -> contextlib.AbstractContextManager[Any]:
-    """Batch statistics stay float32, whatever the network computes in."""
-    return jax.numpy_dtype_promotion("standard")
+def _teach_judge(
+    graph: Any,
+    tx: optax.GradientTransformation,
+    judge: tuple[Any, Any, Any],
+    x: Array,
+    real: Array,
+    fake: Array,
+    key: Key[Array, ""],
+    dtype: Any,
+) -> tuple[tuple[Any, Any, Any], dict[str, Array]]:
+    """A step of D: its parameters, statistics and optimiser's state, and what to tell of it."""
+    params, statistics, opt = judge
+    fake = jax.lax.stop_gradient(fake)
+
+    def judge_loss(params: Any) -> tuple[Array, tuple]:
+        real_logits, rest = _ask(graph, params, statistics, x, real, dtype=dtype)
+        fake_logits, rest = _ask(graph, params, rest, x, fake, dtype=dtype)
+        k_real, k_fake = jax.random.split(key)
+        value = discriminator_loss(
+            real_logits,
+            fake_logits,
+            soft_labels(k_real, real_logits.shape, real=True),
+            soft_labels(k_fake, fake_logits.shape, real=False),
+        )
+        right = jnp.mean((real_logits > 0).astype(jnp.float32)) + jnp.mean(
+            (fake_logits < 0).astype(jnp.float32)
+        )
+        return value, (rest, 0.5 * right)
+
+    (loss, (rest, accuracy)), grads = jax.value_and_grad(judge_loss, has_aux=True)(params)
+    updates, opt = _update(tx, grads, opt, params)
+    learned = optax.apply_updates(params, updates)
+    told = {"discriminator": loss, "discriminator_accuracy": accuracy}
+    return (learned, _kept(jnp.isfinite(loss), rest, statistics), opt), told
+
+
+def _ask(
+    graph: Any, params: Any, rest: Any, *inputs: Any, dtype: Any, train: bool = True
+) -> tuple[Any, Any]:
+    """What a network answers, computed in ``dtype``, and its statistics after it."""
+    lowered = jax.tree.map(lambda v: v.astype(dtype), params)
+    network = nnx.merge(graph, lowered, rest, copy=True)
+    if train:
+        network.train()
+    else:
+        network.eval()
+    # Batch statistics stay float32, whatever the network computes in.
+    with jax.numpy_dtype_promotion("standard"):
+        out = network(*(x.astype(dtype) if isinstance(x, jax.Array) else x for x in inputs))
+    answers = jax.tree.map(lambda m: m.astype(jnp.float32), out)
+    return answers, nnx.state(network, nnx.Not(nnx.Param))
+
+
+def _kept(fine: Array, new: Any, old: Any) -> Any:
+    """Statistics of a batch, or those before it where the batch wasn't finite."""
+    return jax.tree.map(lambda a, b: jnp.where(fine, a, b), new, old)
 
 
 def _update(tx: optax.GradientTransformation, grads: Any, state: Any, params: Any) -> Any:

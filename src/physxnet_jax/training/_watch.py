@@ -1,6 +1,5 @@
 """Watching a run: logs, pictures, early stopping, the balance of the two players."""
 
-import json
 import math
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -8,6 +7,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+
+from ..files import read_lines
 
 METRICS = "metrics.jsonl"
 # A discriminator that is right this often teaches the generator nothing any more.
@@ -26,16 +27,7 @@ _WATCHED = ("discriminator_accuracy", "discriminator", "adversarial")
 
 def read_metrics(folder: str | pathlib.Path) -> list[dict[str, Any]]:
     """All lines of a run's ``metrics.jsonl``; a line cut by a kill is dropped."""
-    path = pathlib.Path(folder) / METRICS
-    if not path.is_file():
-        return []
-    out = []
-    for line in path.read_text().splitlines():
-        try:
-            out.append(json.loads(line))
-        except json.JSONDecodeError:
-            continue
-    return out
+    return read_lines(pathlib.Path(folder) / METRICS)
 
 
 class Validation:

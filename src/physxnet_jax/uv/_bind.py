@@ -30,7 +30,7 @@ class Binding:
         to_body: T_XB, body vertices to garment vertices.
         texel: Texels (rows of the atlas) each vertex samples, shape [vertices, 4].
         weight: Their weights, rows sum to 1, shape [vertices, 4].
-        hit_rate: Share of vertices whose ray met the body.
+        hit_rate: Share of vertices whose ray met the body where it is nearest, no other limb.
         fallbacks: Vertices bound by the closest point instead.
         off_chart: Vertices whose texels were all uncovered, bound to the nearest one.
     """

@@ -39,7 +39,7 @@ class Choice:
 
     Attributes:
         motion: A built-in clip or a motion file.
-        wear: Templates and OBJ files.
+        wear: Templates and garment files.
         method: ``network``, ``lbs`` or ``simulate``.
         weights: Which network, and the ways behind its name (see `load_predictor`).
         push_out: Push vertices that end inside the body onto it.
