@@ -2,6 +2,7 @@
 
 import contextlib
 import pathlib
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -17,6 +18,8 @@ from ._texture import texture_beside, write_textures
 
 _MAX_BYTES = 500_000_000
 _MAX_LIBRARY = 5_000_000
+_FARTHEST = 1e18
+_INDEX = re.compile(r"[+-]?[0-9]{1,18}")
 _NONE = "default"
 # Options of an image in a material file and how many words follow them, for some at most.
 _OPTIONS = {"blendu": 1, "blendv": 1, "bm": 1, "boost": 1, "cc": 1, "clamp": 1, "imfchan": 1}
@@ -48,93 +51,196 @@ def read_obj(path: str | pathlib.Path, part: str | None = None) -> StillMesh:
     blob = path.read_bytes()
     if b"\0" in blob[:4096]:
         raise FormatError(f"{path}: binary data, not OBJ text. Export as OBJ.")
-    vertices: list[list[float]] = []
-    uv: list[list[float]] = []
-    polygons: list[list[tuple[int, int]]] = []
-    where: list[int] = []
-    names: dict[str, int] = {}
-    used, material = -1, list[int]()
-    owners: dict[str, list[str]] = {"o": [], "g": []}
-    current = {"o": "", "g": ""}
-    libraries: list[str] = []
-    for n, line in enumerate(blob.decode("utf-8", "replace").splitlines(), start=1):
-        words = line.split("#")[0].split()
-        if not words:
-            continue
-        if words[0] == "v":
-            vertices.append(_floats(path, n, words[1:4], 3))
-        elif words[0] == "vt":
-            uv.append(_floats(path, n, [*words[1:3], "0"][:2], 2))
-        elif words[0] == "f":
-            polygons.append([_corner(path, n, w, len(vertices), len(uv)) for w in words[1:]])
-            where.append(n)
-            material.append(used)
-            for kind, owner in owners.items():
-                owner.append(current[kind])
-            if len({c[0] for c in polygons[-1]}) < 3:
-                raise FormatError(f"{path}:{n}: a face of fewer than three vertices. Delete it.")
-        elif words[0] in current:
-            current[words[0]] = _rest(line)
-        elif words[0] == "usemtl":
-            used = names.setdefault(_rest(line), len(names))
-        elif words[0] == "mtllib":
-            libraries.append(_rest(line))
-    if not vertices or not polygons:
+    told = _gathered(blob.decode("utf-8", "replace"))
+    if not told.vertices or not told.faces:
         raise FormatError(
-            f"{path}: {len(vertices)} vertices and {len(polygons)} faces; a mesh needs both."
-            " Export the mesh with its faces."
+            f"{path}: {len(told.vertices)} vertices and {len(told.faces)} faces; a mesh needs"
+            " both. Export the mesh with its faces."
         )
-    v = np.asarray(vertices)
-    for n, polygon in zip(where, polygons, strict=True):
-        for a, t in polygon:
-            if not 0 <= a < len(v) or t >= len(uv):
-                raise FormatError(
-                    f"{path}:{n}: a face names vertex {a + 1} or uv {t + 1}, but there"
-                    f" are {len(v)} and {len(uv)}. Export the file again."
-                )
-    owner = owners["o"] if len(set(owners["o"])) > 1 or any(owners["o"]) else owners["g"]
+    v = _numbers(path, told.vertices, told.vertex_lines, 3)
+    uv = _numbers(path, told.uv, told.uv_lines, 2)
+    counts = np.asarray([len(words) for words in told.faces])
+    corners = _corners(path, told, counts, (len(v), len(uv)))
+    material = np.asarray(told.material, np.int32)
+    owner = told.objects if any(told.objects) else told.groups
     parts = tuple(sorted({name for name in owner if name}))
     if part is not None:
-        rows = [k for k, name in enumerate(owner) if name == part]
-        if not rows:
+        mine = np.asarray([name == part for name in owner])
+        if not mine.any():
             there = ", ".join(parts)[:300] or "one mesh without a name"
             raise FormatError(f"{path}: no mesh '{part}'; there is {there}.")
-        polygons, material = [polygons[k] for k in rows], [material[k] for k in rows]
+        corners, counts, material = corners[np.repeat(mine, counts)], counts[mine], material[mine]
         # The others' vertices belong to no face any more; the order stays.
-        kept, at = np.unique([c[0] for p in polygons for c in p], return_inverse=True)
-        v, new = v[kept], iter(at.tolist())
-        polygons = [[(next(new), t) for _, t in p] for p in polygons]
+        kept, at = np.unique(corners[:, 0], return_inverse=True)
+        v, corners = v[kept], np.column_stack([at.reshape(-1), corners[:, 1]])
         parts = (part,)
-    corners = [c for p in polygons for c in _split(p, v)]
-    table = np.asarray(corners)
-    has_uv = bool(uv) and bool((table[..., 1] >= 0).all())
-    looks = _looks(path, libraries)
-    drawn = _drawn(polygons, material, names, looks, textured=has_uv)
-    chart, chart_faces = (np.asarray(uv), table[..., 1]) if has_uv else (None, None)
+    table = corners[_split(counts, v[corners[:, 0]])]
+    has_uv = len(uv) > 0 and bool((corners[:, 1] >= 0).all())
+    looks = _looks(path, told.libraries)
+    drawn = Polygons(
+        counts.astype(np.int32),
+        corners[:, 0].astype(np.int32),
+        corners[:, 1].astype(np.int32) if has_uv else None,
+        material,
+        tuple(looks[n].material if n in looks else Material(n) for n in told.names),
+    )
+    chart, chart_faces = (uv, table[..., 1]) if has_uv else (None, None)
     if chart is not None and chart_faces is not None:
-        moves = {k: looks[n].move for n, k in names.items() if n in looks}
+        moves = {k: looks[n].move for k, n in enumerate(told.names) if n in looks}
         chart, chart_faces, drawn = moved_charts(
             chart, chart_faces, drawn, {k: m for k, m in moves.items() if m is not None}
         )
-    return StillMesh(v, table[..., 0], chart, chart_faces, drawn, len(polygons), parts)
+    return StillMesh(v, table[..., 0], chart, chart_faces, drawn, len(counts), parts)
 
 
-def _drawn(
-    polygons: list[list[tuple[int, int]]],
-    material: list[int],
-    names: dict[str, int],
-    looks: dict[str, "_Look"],
-    *,
-    textured: bool,
-) -> Polygons:
-    corners = np.asarray([c for p in polygons for c in p], np.int32)
-    return Polygons(
-        np.asarray([len(p) for p in polygons], np.int32),
-        corners[:, 0],
-        corners[:, 1] if textured else None,
-        np.asarray(material, np.int32),
-        tuple(looks[n].material if n in looks else Material(n) for n in names),
-    )
+class _Told(NamedTuple):
+    """What the lines of a file say, word by word.
+
+    Attributes:
+        vertices: Words of each vertex.
+        vertex_lines: Lines they stand in, from 1.
+        uv: Words of each texture coordinate.
+        uv_lines: Their lines.
+        faces: Words of each face's corners.
+        face_lines: Their lines.
+        before: Vertices and texture coordinates that there were before each face.
+        material: Place of each face's material in ``names``; -1 without one.
+        objects: Name of the object each face is in.
+        groups: Name of its group.
+        names: Materials, in the order of their first use.
+        libraries: Material files.
+    """
+
+    vertices: list[list[str]]
+    vertex_lines: list[int]
+    uv: list[list[str]]
+    uv_lines: list[int]
+    faces: list[list[str]]
+    face_lines: list[int]
+    before: list[tuple[int, int]]
+    material: list[int]
+    objects: list[str]
+    groups: list[str]
+    names: list[str]
+    libraries: list[str]
+
+
+def _gathered(text: str) -> _Told:
+    told = _Told(*([] for _ in _Told._fields))
+    places: dict[str, int] = {}
+    used, current = -1, {"o": "", "g": ""}
+    for n, line in enumerate(text.splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        key = words[0]
+        if key == "v":
+            told.vertices.append(words[1:4])
+            told.vertex_lines.append(n)
+        elif key == "vt":
+            told.uv.append([*words[1:3], "0"][:2])
+            told.uv_lines.append(n)
+        elif key == "f":
+            told.faces.append(words[1:])
+            told.face_lines.append(n)
+            told.before.append((len(told.vertices), len(told.uv)))
+            told.material.append(used)
+            told.objects.append(current["o"])
+            told.groups.append(current["g"])
+        elif key in current:
+            current[key] = _rest(line)
+        elif key == "usemtl":
+            used = places.setdefault(_rest(line), len(places))
+        elif key == "mtllib":
+            told.libraries.append(_rest(line))
+    told.names.extend(places)
+    return told
+
+
+def _numbers(
+    path: pathlib.Path, rows: list[list[str]], lines: list[int], count: int
+) -> Float[np.ndarray, "rows numbers"]:
+    """Numbers of lines, all at once; one by one where something is wrong, to say where."""
+    try:
+        flat = np.array([float(w) for words in rows for w in words])
+    except ValueError:
+        flat = np.zeros(0)
+    # Beyond that their squares aren't finite in float32.
+    whole = all(len(words) == count for words in rows) and len(flat) == count * len(rows)
+    if whole and (np.abs(flat) < _FARTHEST).all():
+        return flat.reshape(-1, count)
+    for n, words in zip(lines, rows, strict=True):
+        try:
+            values = [float(w) for w in words]
+        except ValueError:
+            raise FormatError(
+                f"{path}:{n}: '{' '.join(words)[:60]}' aren't numbers. Export again."
+            ) from None
+        if len(values) != count or not all(abs(x) < _FARTHEST for x in values):
+            raise FormatError(
+                f"{path}:{n}: expected {count} finite numbers, got {values}. Export again."
+            )
+    return flat.reshape(-1, count)
+
+
+def _corners(
+    path: pathlib.Path, told: _Told, counts: Int[np.ndarray, " faces"], there: tuple[int, int]
+) -> Int[np.ndarray, "corners 2"]:
+    """Vertex and texture coordinate of every corner, from 0; -1 without one."""
+    words = [word for face in told.faces for word in face]
+    face = np.repeat(np.arange(len(counts)), counts)
+
+    def fail(corner: int, problem: str) -> FormatError:
+        line, word = told.face_lines[face[corner]], words[corner][:40]
+        return FormatError(f"{path}:{line}: '{word}' {problem}. Export again.")
+
+    pairs = [[*word.split("/"), ""][:2] for word in words]
+    try:
+        index = np.array([(int(a), int(t) if t else 0) for a, t in pairs], np.int64)
+    except (ValueError, OverflowError):
+        for k, (a, t) in enumerate(pairs):
+            if not (_INDEX.fullmatch(a) and (not t or _INDEX.fullmatch(t))):
+                raise fail(k, "isn't a face corner") from None
+        raise FormatError(f"{path}: faces that can't be read. Export again.") from None
+    index = index.reshape(-1, 2)
+    before = np.asarray(told.before)[face]
+    given = np.array([bool(t) for _, t in pairs], bool)
+    wrong = (index[:, 0] == 0) | (given & (index[:, 1] == 0)) | (index[:, 1] < -before[:, 1])
+    if wrong.any():
+        raise fail(int(wrong.argmax()), "isn't an index from 1")
+    out = np.where(index > 0, index - 1, before + index)
+    out[~given, 1] = -1
+    order = np.lexsort((out[:, 0], face))
+    new = np.diff(out[order, 0], prepend=-1) != 0
+    new |= np.diff(face[order], prepend=-1) != 0
+    few = np.bincount(face[order][new], minlength=len(counts)) < 3
+    if few.any():
+        line = told.face_lines[int(few.argmax())]
+        raise FormatError(f"{path}:{line}: a face of fewer than three vertices. Delete it.")
+    lost = (out[:, 0] < 0) | (out[:, 0] >= there[0]) | (out[:, 1] >= there[1])
+    if lost.any():
+        k = int(lost.argmax())
+        raise FormatError(
+            f"{path}:{told.face_lines[face[k]]}: a face names vertex {out[k, 0] + 1} or uv"
+            f" {out[k, 1] + 1}, but there are {there[0]} and {there[1]}. Export the file again."
+        )
+    return out
+
+
+def _split(
+    counts: Int[np.ndarray, " faces"], points: Float[np.ndarray, "corners 3"]
+) -> Int[np.ndarray, "triangles 3"]:
+    """Triangles of faces, as rows of their corners: a quad along its shorter diagonal."""
+    starts = np.cumsum(counts) - counts
+    turned = np.zeros(len(counts), np.int64)
+    quads = np.flatnonzero(counts == 4)
+    p = points[starts[quads][:, None] + np.arange(4)]
+    across = [np.sum((p[:, k] - p[:, k + 2]) ** 2, axis=1) for k in range(2)]
+    turned[quads] = across[0] > across[1]
+    face = np.repeat(np.arange(len(counts)), counts - 2)
+    k = np.arange(len(face)) - np.repeat(np.cumsum(counts - 2) - (counts - 2), counts - 2) + 1
+    fan = np.stack([np.zeros_like(k), k, k + 1], axis=1) + turned[face][:, None]
+    return starts[face][:, None] + fan % counts[face][:, None]
 
 
 class _Look(NamedTuple):
@@ -271,38 +377,3 @@ def write_materials(path: str | pathlib.Path, materials: Sequence[Material]) -> 
     with whole_file(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return [path, *images.values()]
-
-
-def _floats(path: pathlib.Path, n: int, words: list[str], count: int) -> list[float]:
-    try:
-        out = [float(w) for w in words]
-    except ValueError:
-        raise FormatError(
-            f"{path}:{n}: '{' '.join(words)[:60]}' aren't numbers. Export again."
-        ) from None
-    # Beyond that their squares aren't finite in float32.
-    if len(out) != count or not (np.abs(out) < 1e18).all():
-        raise FormatError(f"{path}:{n}: expected {count} finite numbers, got {out}. Export again.")
-    return out
-
-
-def _corner(path: pathlib.Path, n: int, word: str, vertices: int, uvs: int) -> tuple[int, int]:
-    parts = word.split("/")
-    try:
-        a = int(parts[0])
-        t = int(parts[1]) if len(parts) > 1 and parts[1] else 0
-    except ValueError:
-        raise FormatError(f"{path}:{n}: '{word[:40]}' isn't a face corner. Export again.") from None
-    if a == 0 or (len(parts) > 1 and parts[1] and t == 0) or t < -uvs:
-        raise FormatError(f"{path}:{n}: '{word[:40]}' isn't an index from 1. Export again.")
-    a = a - 1 if a > 0 else vertices + a
-    t = t - 1 if t > 0 else (uvs + t if t < 0 else -1)
-    return a, t
-
-
-def _split(polygon: list[tuple[int, int]], v: np.ndarray) -> list[list[tuple[int, int]]]:
-    if len(polygon) == 4:
-        p = v[[c[0] for c in polygon]]
-        if np.sum((p[0] - p[2]) ** 2) > np.sum((p[1] - p[3]) ** 2):
-            polygon = polygon[1:] + polygon[:1]
-    return [[polygon[0], polygon[k], polygon[k + 1]] for k in range(1, len(polygon) - 1)]
