@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import MotionError
 from ..files import is_file
 from ._source import MAX_JOINT_FRAMES, SourceClip
-from ._text import is_count, numbers, read_lines
+from ._text import is_count, numbers, read_lines, table
 
 # CMU's files carry no rate; the database was captured at 120 Hz.
 CMU_FPS = 120.0
@@ -201,7 +201,8 @@ def _read_frames(
     path: pathlib.Path, lines: list[str], bones: dict[str, _Bone]
 ) -> dict[str, np.ndarray]:
     moving = [name for name, bone in bones.items() if bone.dof]
-    rows: dict[str, list[list[float]]] = {name: [] for name in moving}
+    # Lines of each: read twice, they needn't be held as words.
+    rows: dict[str, list[int]] = {name: [] for name in moving}
     frame = 0
     first: int | None = None
     for n, line in enumerate(lines, start=1):
@@ -244,18 +245,20 @@ def _read_frames(
                 f" {len(bones[name].dof)} channels",
                 "The line is damaged, or the ASF is another subject's",
             )
-        rows[name].append(numbers(path, n, words[1:]))
+        rows[name].append(n)
         if len(rows[name]) > frame:
             raise MotionError.at(path, n, f"'{name}' twice in frame {frame}", "Repair it")
     if frame == 0:
         raise MotionError.at(path, len(lines), "no frame in the file", "Export it again")
     _check_complete(path, len(lines), rows, frame)
-    return {name: np.asarray(values) for name, values in rows.items() if values}
+    return {
+        name: table(path, lines, where, 1, len(bones[name].dof))
+        for name, where in rows.items()
+        if where
+    }
 
 
-def _check_complete(
-    path: pathlib.Path, n: int, rows: dict[str, list[list[float]]], frame: int
-) -> None:
+def _check_complete(path: pathlib.Path, n: int, rows: dict[str, list[int]], frame: int) -> None:
     """Every bone that moved in the first frame must be in each frame."""
     for name, values in rows.items():
         if len(values) != frame and (values or name == "root"):

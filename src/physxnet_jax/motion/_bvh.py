@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
 from ._source import MAX_JOINT_FRAMES, SourceClip, nominal_rate
-from ._text import is_count, numbers, read_lines
+from ._text import is_count, numbers, read_lines, table
 
 _AXES = {"Xrotation": "X", "Yrotation": "Y", "Zrotation": "Z"}
 _SLOTS = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
@@ -254,8 +254,7 @@ def _read_motion(
             f"{len(rows)} frames of the {count[0]} announced",
             "The file is truncated: export again, or correct 'Frames:'",
         )
-    values = []
-    for n, row in rows[: int(count[0])]:
+    for n, row in rows:
         words = row.split()
         if len(words) != width:
             raise MotionError.at(
@@ -264,7 +263,7 @@ def _read_motion(
                 f"{len(words)} values where the channels need {width}",
                 "The line is damaged, or CHANNELS doesn't match: export again",
             )
-        values.append(numbers(path, n, words))
+    values = table(path, lines, [n for n, _ in rows], 0, width)
     # 0.0083333 is meant to be 1/120.
     fps = 1.0 / step[0]
     if not 1.0 <= fps <= 2000.0:
@@ -274,4 +273,4 @@ def _read_motion(
             f"a Frame Time of {step[0]} means {fps:.3g} frames a second",
             "Write it in seconds: 0.00833333 for 120 fps",
         )
-    return np.asarray(values), nominal_rate(fps)
+    return values, nominal_rate(fps)

@@ -2,6 +2,10 @@
 
 import math
 import pathlib
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
 
 from ..errors import MotionError
 from ..files import is_file
@@ -76,3 +80,30 @@ def numbers(path: pathlib.Path, line: int, words: list[str]) -> list[float]:
                 "Cut this frame out or interpolate over it",
             )
     return out
+
+
+def table(
+    path: pathlib.Path, lines: Sequence[str], which: Sequence[int], skip: int, width: int
+) -> Float[np.ndarray, "rows numbers"]:
+    """Numbers of many lines at once.
+
+    Args:
+        path: The file, for errors.
+        lines: All its lines.
+        which: Those wanted, counted from 1; each has `width` words after the first `skip`.
+        skip: Words before the numbers.
+        width: Numbers of a line.
+
+    Raises:
+        MotionError: As `numbers`, of the first line where something is wrong.
+    """
+    words = (word for n in which for word in lines[n - 1].split()[skip:])
+    try:
+        flat = np.fromiter(map(float, words), np.float64, len(which) * width)
+        fine = bool((np.abs(flat) <= _LARGEST).all())
+    except ValueError:
+        flat, fine = np.zeros(0), False
+    if not fine:
+        for n in which:
+            numbers(path, n, lines[n - 1].split()[skip:])
+    return flat.reshape(len(which), width)
