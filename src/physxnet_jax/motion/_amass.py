@@ -101,7 +101,7 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
         raise MotionError.at(
             path,
             None,
-            f"frame {int(np.argmax(bad))} is not finite, or turns on and on",
+            f"frame {int(np.argmax(bad))} is not finite, or no pose",
             "Cut the frame out or interpolate over it",
         )
     names = tuple(name for name, _, _ in _FIGURE)
