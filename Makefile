@@ -1,4 +1,5 @@
 # Two commands matter: `make demo` and `make test`. Both set up .venv by themselves.
+# `make test-all` runs slow tests too, which look longer at what others look at as well.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -7,7 +8,7 @@ SRC := $(shell find src tests experiments -name '*.py' 2>/dev/null)
 # Many processes load the same libraries: the first leaves them compiled.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test check docs format clean
+.PHONY: demo test test-all check docs format clean
 
 # One environment serves all targets; uv.lock decides every version.
 $(VENV)/.ready: pyproject.toml uv.lock
@@ -22,6 +23,9 @@ demo: $(VENV)/.ready
 
 test: $(VENV)/.ready
 	$(BIN)/python -m pytest
+
+test-all: $(VENV)/.ready
+	$(BIN)/python -m pytest -m "slow or not slow"
 
 check: $(VENV)/.ready
 	$(BIN)/ruff check .

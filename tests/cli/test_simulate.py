@@ -227,6 +227,7 @@ def test_a_stopped_rollout_goes_on_and_ends_the_same(tmp_path):
     assert not keep.exists()
 
 
+@pytest.mark.slow
 def test_the_price_list_tells_effects_that_matter_from_those_that_do_not(tmp_path, capsys):
     # A sheet pinned to the hips a metre and a half before the body: no contact, little air.
     g = square_sheet(5, pinned=np.arange(5))

@@ -68,6 +68,7 @@ def character(man):
     return make_character(mesh, FPS, bind=bind)
 
 
+@pytest.mark.slow
 def test_a_stranger_wears_what_he_would_wear(man, character):
     shape, clip, mesh, _ = man
     assert character.apart < 0.008 and character.missed < 0.01
@@ -85,6 +86,7 @@ def test_a_stranger_wears_what_he_would_wear(man, character):
     assert all(worn.inside[n] <= worn.inside_raw[n] for n in worn.inside)
 
 
+@pytest.mark.slow
 def test_what_is_moved_off_his_skin_stays_beneath_what_is_over_it(character, monkeypatch):
     known = []
 

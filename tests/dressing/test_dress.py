@@ -69,6 +69,7 @@ def test_trousers_go_beneath_a_top_and_stay_as_they_are_without_one():
     assert gap[:, rest_height < -0.4].max() < 1e-4
 
 
+@pytest.mark.slow
 def test_two_garments_of_one_name_and_one_called_body_stay_apart(tmp_path):
     named = dataclasses.replace(template("bottom"), name="body")
     clip = dress("walk", [named, "bottom", "bottom"], method="lbs", frames=2)

@@ -111,6 +111,7 @@ def test_the_shape_of_a_dress_by_the_papers_network_is_refused(dresser):
         with_shape(skirt, dresser.body.default_shape())
 
 
+@pytest.mark.slow
 def test_the_root_pulls_the_cloth_along(dresser, motion):
     """The mean height of the cloth rises with the root, one for one, whatever is between."""
     rotations, root = motion
@@ -236,6 +237,7 @@ def test_weights_are_loaded_inside_a_traced_function_too(motion):
     assert float(total(jnp.ones(()))) == pytest.approx(want, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_a_predictor_of_another_person_dresses_this_one(dresser, shapes, motion):
     """Its texels are put onto the body that is asked for, whatever body they were on."""
     heavy = make_dresser(["bottom"], shape=shapes[0])
@@ -261,6 +263,7 @@ def test_what_is_told_of_files_is_no_part_of_the_program(dresser):
     assert told.notes == ("a",) and jax.tree.structure(told) == jax.tree.structure(other)
 
 
+@pytest.mark.slow
 def test_people_are_spread_over_devices_by_shard_map(tmp_path):
     """In a process of two devices: one person on each is what one process says of both."""
     code = """
@@ -295,7 +298,7 @@ print(len(jax.devices()), "devices")
     assert done.returncode == 0 and "2 devices" in done.stdout, done.stderr[-2000:]
 
 
-@pytest.mark.parametrize("fps", [30.0, 120.0])
+@pytest.mark.parametrize("fps", [30.0, pytest.param(120.0, marks=pytest.mark.slow)])
 def test_a_clip_begins_without_a_jump(fps):
     """Cloth accelerates in the first frames as in those after, however many there are a second."""
     walk = load_motion("walk", fps=fps)
@@ -322,6 +325,7 @@ def test_a_clip_begins_without_a_jump(fps):
         assert jumps(thrown)[:4].max() > 5.0 * now[4:].max()
 
 
+@pytest.mark.slow
 def test_an_export_moves_at_the_rate_that_it_is_for(dresser, motion, tmp_path):
     """Velocities are metres a second: the same poses twice as fast are another cloth."""
     pytest.importorskip("flatbuffers")

@@ -165,7 +165,7 @@ def test_a_spoiled_motion_is_refused_on_the_host(motion):
     "values",
     [
         {"gender": 1.0, "height_up": 1.0, "weight_up": 1.0},
-        {"height_down": 1.0, "weight_down": 1.0},
+        pytest.param({"height_down": 1.0, "weight_down": 1.0}, marks=pytest.mark.slow),
     ],
     ids=["huge", "tiny"],
 )

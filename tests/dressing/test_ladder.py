@@ -113,6 +113,7 @@ def test_what_another_process_has_timed_is_kept(tmp_path):
     assert kept["machine"]["processor"] == processor_name()
 
 
+@pytest.mark.slow
 def test_what_follows_the_network_is_timed_once_for_all(tmp_path):
     rungs = [rung(n, 10.0) for n in ("nano", "nano+push", "nano+relax+push", "small+relax+push")]
     path = tmp_path / "times.json"

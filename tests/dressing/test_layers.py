@@ -142,6 +142,7 @@ def test_coarse_triangles_are_as_near_as_fine_ones():
     assert len(known.rows) > 1000 and len(missed) < 0.002 * len(layer.rows)
 
 
+@pytest.mark.slow
 def test_of_two_alike_the_second_stays_over_the_first_live_and_in_clips():
     """Two of the same trousers: by the network alone each vertex lies on its own twin."""
     motion = load_motion("punch", fps=30.0)

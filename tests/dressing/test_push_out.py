@@ -96,7 +96,7 @@ def test_gradients_through_a_skirt_in_a_stride_are_finite(body, rest, stride):
         assert np.isfinite(np.asarray(g)).all() and np.abs(np.asarray(g)).max() > 0
 
 
-@pytest.mark.parametrize("name", ["bottom", "dress"])
+@pytest.mark.parametrize("name", [pytest.param("bottom", marks=pytest.mark.slow), "dress"])
 def test_frame_by_frame_is_all_at_once(body, rest, name):
     """The way CPUs take against one batch; gradients where they compile quickly."""
     world, shift = clip_transforms(body, rest, load_motion("walk", fps=30.0))

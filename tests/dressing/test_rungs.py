@@ -92,6 +92,7 @@ def test_a_spoiled_frame_is_flagged_live_and_passes(dresser, motion):
     )
 
 
+@pytest.mark.slow
 def test_a_clip_of_one_frame_is_somebody_who_stands_still(dresser, motion):
     rotations, root = (jnp.repeat(x[:1], len(x), axis=0) for x in motion)
     run = jax.jit(lambda q, p: clothe(dresser, q, p, 30.0)["bottom"])
@@ -102,7 +103,16 @@ def test_a_clip_of_one_frame_is_somebody_who_stands_still(dresser, motion):
     assert np.isfinite(slope).all() and np.abs(slope).max() > 0
 
 
-@pytest.mark.parametrize("weights", ["nano", "small", "local+relax", "pair+mirror", "paper"])
+@pytest.mark.parametrize(
+    "weights",
+    [
+        "nano",
+        pytest.param("small", marks=pytest.mark.slow),
+        "local+relax",
+        pytest.param("pair+mirror", marks=pytest.mark.slow),
+        "paper",
+    ],
+)
 def test_the_slope_by_the_pose_is_the_differences_at_every_rung(dresser, motion, weights):
     """And by the weights. The mean height of a leg that is bent, without push-out's corners."""
     person = make_dresser(["bottom"], weights=weights, push_out=False)

@@ -33,6 +33,7 @@ def rows():
     return list(bench_simulation([small], methods=methods))
 
 
+@pytest.mark.slow
 def test_doing_nothing_lands_worst_and_more_substeps_nearer(rows):
     by = {(r.solver, r.setting): r for r in rows}
     assert not any(r.failed for r in rows)

@@ -20,6 +20,7 @@ def test_drape_lies_in_its_published_band(name):
     assert drape.speed < 0.3, "nearly at rest"
 
 
+@pytest.mark.slow
 def test_a_board_stays_flat_and_a_rag_hangs_down():
     """The controls: the instrument's two ends."""
     stiff = dataclasses.replace(FABRICS["cotton"], bend=1e-2)

@@ -213,6 +213,7 @@ def test_however_it_lies_and_faces_it_is_put_where_the_template_is(name):
         assert how[:4] in told and ("turned" in told) == ("turned" in how) and off < 0.2
 
 
+@pytest.mark.slow
 def test_what_hangs_in_the_air_is_let_down(tmp_path, capsys):
     """A sleeveless top with a wide neck, placed too high, rests on the shoulders in the end."""
     g = template("top")
@@ -388,6 +389,7 @@ def test_real_garments_were_made_for_the_rest_pose(data_dir):
     assert len(found) == 8 and not any(found.values())
 
 
+@pytest.mark.slow
 def test_edges_are_as_short_as_asked_for_whatever_lifting_does(tmp_path):
     coarse, _ = decimate(template("top").mesh, 0.07)
     path = saved(tmp_path, "a.obj", np.asarray(coarse.vertices), np.asarray(coarse.faces))

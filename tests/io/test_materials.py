@@ -118,6 +118,7 @@ def test_textures_stay_with_their_corners(quilted, tmp_path):
         np.testing.assert_allclose(back.uv[back.polygons.uv_corners], wanted, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_fitted_garment_keeps_them(quilted, tmp_path):
     done, _ = fit_garment(quilted, tmp_path / "fitted.obj")
     before, after = read_obj(quilted).polygons, read_obj(tmp_path / "fitted.obj").polygons

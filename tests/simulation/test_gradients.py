@@ -120,6 +120,7 @@ def test_a_rescaled_scene_is_the_scene_made_of_that_cloth(solver, elastic, body,
     assert np.abs(made - told).max() < 2e-5 and np.abs(made - plain).max() > 2e-3
 
 
+@pytest.mark.slow
 def test_a_bending_stiffness_is_recovered_from_motion(body, rest):
     """Newton on its logarithm, by gradients alone: within 5 per cent of the truth."""
     fabric = Fabric(stretch=500.0, bend=2e-4)

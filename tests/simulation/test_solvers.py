@@ -85,6 +85,7 @@ def test_doing_nothing_is_the_worst_of_all(reference):
     assert rms(last(free, XPBD(32, 1)), truth) > 100 * rms(last(scene, XPBD(32, 4)), truth)
 
 
+@pytest.mark.slow
 def test_solvers_agree_on_membrane_and_dihedral_bending():
     scene = swinging((Membrane(), Dihedral()))
     truth = last(scene, Verlet(substeps=512, queries=1), 2)

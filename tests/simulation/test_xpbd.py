@@ -94,6 +94,7 @@ def test_energy_never_grows_from_a_stretched_start():
     assert info["strain_max"][-1] < 0.3
 
 
+@pytest.mark.slow
 def test_halving_the_step_halves_the_error():
     g = sheet(5, pinned=np.arange(5))
     effects = (Gravity(), Stretch(), Bend(), Pin())

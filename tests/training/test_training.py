@@ -98,6 +98,7 @@ def test_batches_are_permutations_that_the_step_alone_decides():
     assert not np.array_equal(batch_indices(40, 8, 3, 0), batch_indices(40, 8, 3, 5))
 
 
+@pytest.mark.slow
 def test_twenty_steps_are_ten_and_ten_bitwise(tmp_path):
     data = [sequence()]
     config = dataclasses.replace(CONFIG, optimiser="muon")
@@ -228,6 +229,7 @@ def test_differences_along_edges_know_nothing_of_what_all_vertices_share():
             assert float(value) == pytest.approx((1.0 - share) * folded + share * differences)
 
 
+@pytest.mark.slow
 def test_losses_along_edges_and_of_larger_parts_teach(tmp_path):
     model = dataclasses.replace(CONFIG.model, templates=("bottom",))
     config = dataclasses.replace(CONFIG, model=model, adversarial=False, epochs=20)
@@ -261,6 +263,7 @@ def test_runs_that_can_not_be_are_refused(changes, says):
         dataclasses.replace(CONFIG, **changes)
 
 
+@pytest.mark.slow
 def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):
     config = dataclasses.replace(CONFIG, validation=("b",), validate_every=4, epochs=40, patience=2)
     data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
@@ -283,6 +286,7 @@ def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):
     assert list((tmp_path / "events").iterdir()), "TensorBoard can show it"
 
 
+@pytest.mark.slow
 def test_mirrored_actions_are_learned_from_too(tmp_path):
     config = dataclasses.replace(
         CONFIG, mirror=True, validation=("b",), adversarial=False, validate_every=100, epochs=1
@@ -389,6 +393,7 @@ def test_either_players_loss_raises_the_alarm_whatever_the_accuracy(loss, value,
     assert seen["gan_alarm"] == alarm
 
 
+@pytest.mark.slow
 def test_bfloat16_learns_nearly_as_fast(tmp_path):
     last = {}
     for precision in ("float32", "bfloat16"):
