@@ -2,6 +2,7 @@
 
 import resource
 import struct
+import subprocess
 import sys
 import time
 
@@ -94,3 +95,36 @@ def test_text_is_read_at_once_but_not_what_it_refers_to(binary, monkeypatch):
     root = binary.with_name("root.usda")
     root.write_text('#usda 1.0\ndef "all" (references = @binary.usdc@</shirt>)\n{\n}\n')
     assert len(read_mesh(root).vertices) == 3 and len(started) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        (TEXT, False),
+        (TEXT + 'def "a" {\n' * 50 + "}\n" * 50, False),
+        (TEXT + 'def "a" {\n' * 200 + "}\n" * 200, True),
+        (TEXT + 'def "b" (references = </shirt>) {}\n', True),
+        (TEXT + 'def "b" (inherits = </shirt>) {}\n', True),
+        (TEXT.replace("1.0", "1.0\n(subLayers = [@./b.usda@])", 1), True),
+    ],
+    ids=["plain", "nested", "deep", "references", "inherits", "layers"],
+)
+def test_text_is_tried_where_it_refers_or_is_deep(tmp_path, monkeypatch, text, wanted):
+    tried = []
+    (tmp_path / "a.usda").write_text(text)
+
+    def run(words, **_):
+        tried.append(words)
+        return subprocess.CompletedProcess(words, 0)
+
+    monkeypatch.setattr(_usd_trial.subprocess, "run", run)
+    _usd_trial.try_stage(tmp_path / "a.usda")
+    assert bool(tried) == wanted
+
+
+def test_depth_is_that_of_brackets_wherever_a_text_is_cut(monkeypatch):
+    text = b'def "a" { b = [(1, 2), (3, 4)] }' * 5
+    assert _usd_trial._depth(b"") == 0
+    for piece in (1, 3, 1000):
+        monkeypatch.setattr(_usd_trial, "_PIECE", piece)
+        assert _usd_trial._depth(text) == 3

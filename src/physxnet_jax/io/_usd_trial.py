@@ -22,6 +22,8 @@ _SECONDS, _SECONDS_PER_BYTE = 20.0, 1e-6
 _REFERS = re.compile(rb"@|\b(references|inherits|specializes|payload|variantSets?)\b")
 # Brackets within brackets that a stage of plain meshes has at most.
 _DEEPEST = 100
+# Bytes looked at in one go.
+_PIECE = 1 << 20
 
 # Everything that could be asked for is read once.
 _TRIAL = """
@@ -43,10 +45,14 @@ for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
 
 def _depth(text: bytes) -> int:
     """How deep brackets lie within each other, those in quotes counted too."""
-    letters = np.frombuffer(text, np.uint8)
-    opening, closing = (np.isin(letters, np.frombuffer(b, np.uint8)) for b in (b"{[(", b"}])"))
-    steps = opening[opening | closing].astype(np.int64) * 2 - 1
-    return int(np.cumsum(steps).max(initial=0))
+    step = np.zeros(256, np.int8)
+    step[list(b"{[(")], step[list(b"}])")] = 1, -1
+    depth = most = 0
+    for at in range(0, len(text), _PIECE):
+        piece = np.frombuffer(text, np.uint8, min(_PIECE, len(text) - at), at)
+        depths = depth + np.cumsum(step[piece], dtype=np.int64)
+        depth, most = int(depths[-1]), max(most, int(depths.max()))
+    return most
 
 
 def try_stage(path: pathlib.Path) -> None:
