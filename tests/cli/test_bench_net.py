@@ -11,7 +11,8 @@ from flax import nnx
 
 from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
-from physxnet_jax.cli._bench_net import _place, _with_errors, engines, floors, points
+from physxnet_jax.cli._bench_net import _as, _place, _with_errors, engines, floors, points
+from physxnet_jax.cli._experiment_commands import Bench
 from physxnet_jax.data import Sequence
 from physxnet_jax.dressing import Cost, mean_errors
 from physxnet_jax.evaluation import skinning
@@ -123,6 +124,30 @@ def test_gradients_are_measured_when_asked_for(tiny, tmp_path, hasty):
     assert len(hasty) == 2, "a dozen networks' programs are more maps than a process may have"
     for r in rows:
         assert r["ms_backward"] > r["ms_per_frame"] and r["backward_mb"] > 1
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--garments", "4"], "from 1 to 3"),
+        (["--weights", "nano", "runs/nano"], "called the same"),
+        (["--times"], "there are none"),
+    ],
+)
+def test_tables_that_would_mislead_are_refused(words, says, capsys):
+    assert main(["bench", "net", "--weights", "nano", *words]) == 2
+    assert says in " ".join(capsys.readouterr().err.split())
+
+
+def test_times_are_taken_of_the_rows_that_are_there():
+    nan = float("nan")
+    known = [
+        Cost("network", "nano", "cpu", batch, g, nan, 1.0, 0.5, 1.0, 9, nan, 0.1, nan, slope)
+        for batch, g, slope in ((1, 2, nan), (32, 2, 4.0), (1, 3, nan))
+    ]
+    again = _as(Bench("net", garments=(1,), batches=(8,)), known)
+    assert (again.garments, again.batches, again.backward) == ((2, 3), (1, 32), True)
+    assert not _as(Bench("net"), known[:1]).backward
 
 
 def test_mean_errors_are_those_of_the_actions():

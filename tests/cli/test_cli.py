@@ -152,8 +152,16 @@ def test_a_stop_by_hand_says_what_is_left_and_debug_shows_the_trace(monkeypatch,
         patched.setattr("physxnet_jax.cli._main._run", stopped)
         assert main(["dress", "walk"]) == 130
         assert "nothing half-written" in capsys.readouterr().err
-        assert main(["simulate", "walk"]) == 130
-        assert "kept for the next run" in capsys.readouterr().err
+        for words, kept in (
+            (["simulate", "walk"], False),
+            (["simulate", "walk", "-o", "a.npz"], True),
+            (["simulate", "walk", "-o", "a.npz", "--engine", "blender"], False),
+            (["evaluate", "lbs", "--data", "a"], False),
+            (["evaluate", "lbs", "--data", "a", "--out", "a.json"], True),
+            (["bench", "net", "--out", "a.json"], True),
+        ):
+            assert main(words) == 130
+            assert ("kept for the next run" in capsys.readouterr().err) == kept, words
     with pytest.raises(PhysXNetError, match="built-in clip"):
         main(["dress", "wlak", "--debug"])
 
@@ -291,3 +299,16 @@ def test_a_captured_dance_wears_a_file_from_elsewhere(data_dir, tmp_path, capsys
     assert np.isfinite(first).all() and np.abs(last - first).max() > 1e-3
     height = np.ptp(first[:, 1])
     assert 0.4 < height < 1.2, "in metres, on the dancer"
+
+
+def test_brackets_in_a_path_are_no_markup(tmp_path, capsys):
+    out = tmp_path / "walk[v2][/].npz"
+    assert main(["dress", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "2",
+                 "-o", str(out)]) == 0  # fmt: skip
+    assert "walk[v2][/].npz" in capsys.readouterr().out.replace("\n", "")
+
+
+def test_a_time_and_an_error_at_once_are_refused_before_anything_is_read(capsys):
+    words = ["--budget-ms", "5", "--max-error-mm", "20", "--character", "none.glb"]
+    assert main(["dress", "walk", "--wear", "top", *words]) == 2
+    assert "either a time" in capsys.readouterr().err

@@ -108,6 +108,33 @@ def test_a_scene_keeps_effects_of_ones_own_and_nothing_twice():
         prepare_scene(twice)
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--engine", "blender", "--wind", "0", "0", "4"],
+        ["--engine", "newton", "--self-contact"],
+        ["--engine", "blender", "--accuracy", "fine"],
+        ["--engine", "bdf2", "--accuracy", "fine"],
+    ],
+)
+def test_what_an_engine_would_leave_out_is_refused(words, capsys):
+    assert main(["simulate", "walk", "--wear", "bottom", *words]) == 2
+    assert "leave" in capsys.readouterr().err
+
+
+def test_a_mesh_of_a_file_beside_a_scene_is_found(tmp_path, monkeypatch):
+    mesh = template("bottom").mesh
+    (tmp_path / "in").mkdir()
+    write_obj(tmp_path / "in/a.obj", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    text = (tmp_path / "in/a.obj").read_text()
+    (tmp_path / "in/a.obj").write_text(text.replace("\nf ", "\no legs\nf ", 1))
+    monkeypatch.chdir(tmp_path)
+    for word in ("a.obj", "a.obj#legs", "a.obj=bottom", "a.obj#legs=bottom"):
+        (tmp_path / "in/s.toml").write_text(f'motion = "walk"\ngarments = ["{word}"]\n')
+        (garment,) = load_scene(tmp_path / "in/s.toml", frames=2).scene.garments
+        assert garment.template == "bottom"
+
+
 def test_what_dress_tells_of_a_garment_file_is_told_here_too(tmp_path, capsys):
     mesh = template("bottom").mesh
     vertices = np.array(mesh.vertices)
@@ -210,6 +237,9 @@ def test_a_stopped_rollout_goes_on_and_ends_the_same(tmp_path):
     assert len(list(keep.glob("block_*.npz"))) == 2
     with pytest.raises(SimulationError, match="another scene"):
         simulate_batch(scene, [motion], solver=XPBD(16, 2), resume=keep)
+    slower = dataclasses.replace(motion, fps=9.99)
+    with pytest.raises(SimulationError, match="another scene"):
+        simulate_batch(scene, [slower], solver=solver, resume=keep)
     last = max(keep.glob("block_*.npz"))
     blob = last.read_bytes()
     for bad in (blob[: len(blob) // 2], b"", b"never"):

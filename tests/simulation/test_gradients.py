@@ -97,6 +97,19 @@ def test_other_parameters_are_refused(draped):
             system.rescaled(**{name: 2.0})
 
 
+@pytest.mark.parametrize("factor", [-0.5, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["stretch", "bend", "friction"])
+def test_factors_that_mean_nothing_are_refused(draped, name, factor):
+    system = draped.system(STEPS)
+    with pytest.raises(SimulationError, match="expected a"):
+        system.rescaled(**{name: factor})
+    if name == "friction":
+        system.rescaled(friction=0.0)
+    else:
+        with pytest.raises(SimulationError, match="positive"):
+            system.rescaled(**{name: jnp.float32(0.0)})
+
+
 @pytest.mark.parametrize(
     "solver",
     [XPBD(8, 2), Implicit(8, 2), Implicit(8, 2, order=1), Verlet(256, 2, precision="float32")],

@@ -47,7 +47,14 @@ def bench_net(command: Bench, console: Console) -> int:
         if not tests:
             raise FormatError(f"{command.data}: no 'test' actions; build a dataset first.")
     known_errors = _evaluated(command.errors)
+    if not all(1 <= n <= len(TEMPLATES) for n in command.garments):
+        raise FormatError(f"--garments are numbers from 1 to {len(TEMPLATES)}.")
+    names = [pathlib.Path(w).name for w in command.weights]
+    if len(set(names)) < len(names):
+        raise FormatError("two networks are called the same; rename a run's folder.")
     rows = kept_rows(command.out, _from_json)
+    if command.times and not rows:
+        raise FormatError("--times measures rows of --out again, and there are none.")
     plain: Precision = "float32"
     jobs: list[tuple[str, str, Precision]] = [("lbs", "-", plain)]
     jobs.extend(("engine" if s in ENGINES else "simulator", s, plain) for s in command.simulator)
@@ -64,9 +71,11 @@ def bench_net(command: Bench, console: Console) -> int:
             ]
             if command.times:
                 # Errors don't change; a method without any isn't measured anew.
-                again = _measure(kind, size, precision, command, [], {}) if known else ()
+                again = _measure(kind, size, precision, _as(command, known), [], {})
+                there = set(map(_key, known))
+                anew = [r for r in (again if known else ()) if _key(r) in there]
                 rows = [r for r in rows if r not in known]
-                rows += [_with_errors(r, known) for r in again]
+                rows += [_with_errors(r, known) for r in anew]
             else:
                 for some in _missing(command, known) if kind == "network" or not known else ():
                     rows += list(_measure(kind, size, precision, some, tests, known_errors))
@@ -87,6 +96,20 @@ def bench_net(command: Bench, console: Console) -> int:
         )
         console.print(f"wrote {command.out}, .md and .png", highlight=False)
     return 0
+
+
+def _key(row: Cost) -> tuple[str, int, int]:
+    return row.method, row.garments, row.batch
+
+
+def _as(command: Bench, known: Sequence[Cost]) -> Bench:
+    """The command that measured these rows."""
+    return dataclasses.replace(
+        command,
+        garments=tuple(sorted({r.garments for r in known})),
+        batches=tuple(sorted({r.batch for r in known})),
+        backward=any(not math.isnan(r.ms_backward) for r in known),
+    )
 
 
 def _missing(command: Bench, known: Sequence[Cost]) -> Iterator[Bench]:

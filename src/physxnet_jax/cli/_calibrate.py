@@ -17,7 +17,6 @@ from ..dressing import (
     pick_rung,
     worn_key,
 )
-from ..errors import PhysXNetError
 from ..garment import TEMPLATES, Template
 from ..io import load_garment
 from ._commands import Calibrate, Dress
@@ -63,9 +62,6 @@ def choose(command: Dress, progress: Callable[[str, int, int], None]) -> Choice 
     """The rung for a time or an error that was asked for; None if neither was."""
     if command.budget_ms is None and command.max_error_mm is None:
         return None
-    # Before minutes are spent on timing.
-    if command.budget_ms is not None and command.max_error_mm is not None:
-        raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
     ladder = load_ladder()
     templates: list[Template] = [load_garment(g)[0].template for g in command.wear]
     times = measure(ladder, [templates], report=lambda _, k, n: progress("timing", k, n))

@@ -7,6 +7,7 @@ import sys
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from .._environment import jaxlib_problem
 from .._version import __version__
@@ -23,10 +24,13 @@ _OPTIONAL = {
 }
 
 
+_MISSING = "missing"
+
+
 def doctor(console: Console, *, json: bool = False) -> int:
     """Prints versions, devices and optional parts; 1 if jaxlib can't be trusted."""
     rows = [("python", f"{platform.python_version()} ({sys.platform}, {platform.machine()})")]
-    rows += [(name, _version(name) or "[red]missing[/red]") for name in _REQUIRED]
+    rows += [(name, _version(name) or _MISSING) for name in _REQUIRED]
     rows += [(n, _version(n) or f"not installed (extra {use})") for n, use in _OPTIONAL.items()]
     problem = jaxlib_problem(_version("jaxlib") or "", os.environ.get("XLA_FLAGS", ""))
     missing = [name for name in _REQUIRED if _version(name) is None]
@@ -41,17 +45,16 @@ def doctor(console: Console, *, json: bool = False) -> int:
 
         rows.append(("weights", ", ".join(list_weights()) or "none"))
     if json:
-        parts = {name: found.replace("[red]", "").replace("[/red]", "") for name, found in rows}
-        print_json({"version": __version__, "parts": parts, "problem": problem})
+        print_json({"version": __version__, "parts": dict(rows), "problem": problem})
         return int(problem is not None)
     table = Table(title=f"physxnet_jax {__version__}", title_justify="left")
     table.add_column("part")
     table.add_column("found")
-    for row in rows:
-        table.add_row(*row)
+    for name, found in rows:
+        table.add_row(name, Text(found, style="red" if found == _MISSING else ""))
     console.print(table)
     if problem is not None:
-        console.print(f"[red]{problem}[/red]")
+        console.print(problem, style="red")
         return 1
     console.print("jaxlib: no known fault in this version.")
     return 0

@@ -10,7 +10,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from ..data import Sequence, list_sequences, read_sequence
+from ..data import Sequence, dataset_digest, list_sequences, read_sequence
 from ..dressing import method_by_name, weights_folder
 from ..errors import FormatError, PhysXNetError, WeightsError
 from ..evaluation import (
@@ -48,8 +48,10 @@ def evaluate(command: Evaluate, console: Console) -> int:
     if twice:
         raise PhysXNetError(f"two methods are called {twice[0]}; rename a run's folder.")
     rows = _read(command.out)
+    if command.times and not {r.method for r in rows} & set(map(_label, command.methods)):
+        raise PhysXNetError("--times measures rows of --out again, and there are none of these.")
     sequences = [read_sequence(f) for f in folders]
-    digests = {_label(name): _digest(name) for name in command.methods}
+    digests = {_label(name): _digest(name, command) for name in command.methods}
     _check_rows(rows, digests, sequences, command.out)
     with progress_bars(console) as progress:
         # What has all its rows needn't be at hand.
@@ -95,8 +97,13 @@ def evaluate(command: Evaluate, console: Console) -> int:
     return 0
 
 
-def _digest(name: str) -> str:
-    """The checksum of a network's weights; nothing for what is none, or isn't at hand."""
+def _digest(name: str, command: Evaluate) -> str:
+    """The checksum of a network's weights, or of the dataset that a baseline learns from.
+
+    Nothing for what is none, or isn't at hand.
+    """
+    if name in ("nearest", "mlp"):
+        return dataset_digest(command.learn_from or command.data)[0][:DIGITS]
     try:
         return str(read_card(weights_folder(name.removesuffix("+push")))["sha256"])[:DIGITS]
     except (WeightsError, LookupError):

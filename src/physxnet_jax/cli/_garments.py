@@ -63,7 +63,7 @@ def fit(command: Fit, console: Console) -> int:
     longest, coarser = (
         None if mm is None else 1e-3 * mm for mm in (command.edge_length, command.decimate)
     )
-    quiet = Console(quiet=True) if command.json else console
+    quiet = Console(quiet=True, markup=False) if command.json else console
     with progress_bars(quiet) as bars:
         bars("fitting", 0, 1)
         done, result = fit_garment(

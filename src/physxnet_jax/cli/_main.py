@@ -58,10 +58,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: Words after the program's name; the process's own by default.
 
     Returns:
-        0 for success, 1 for a broken installation, 2 for an error of the user's.
+        0 for success; 1 for a broken installation, or where something is wrong with what was
+        looked at (`inspect`, `fit`, `stress`, `dataset check`, `doctor`); 2 for an error of
+        the user's; 130 if stopped by Ctrl-C, 141 if nobody reads any more.
     """
     command = parse(arguments)
-    console = Console(stderr=False)
+    # Paths and names may have brackets in them.
+    console = Console(stderr=False, markup=False)
     try:
         return _run(command, console)
     except PhysXNetError as error:
@@ -79,10 +82,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
         Console(stderr=True, soft_wrap=True).print(f"physxnet: {error}", style="red", markup=False)
         return 2
     except KeyboardInterrupt:
-        goes_on = isinstance(command, Simulate | Dataset | Train | Evaluate | Calibrate)
-        left = "what is done is kept for the next run" if goes_on else ""
+        left = "what is done is kept for the next run" if _goes_on(command) else ""
         Console(stderr=True).print(f"physxnet: stopped; {left or 'nothing half-written is left'}.")
         return 130
+
+
+def _goes_on(command: object) -> bool:
+    """Whether a command that was stopped goes on from there the next time."""
+    if isinstance(command, Simulate):
+        here = command.engine in ("xpbd", "bdf2")
+        return here and (command.out or command.preview) is not None
+    if isinstance(command, Evaluate | Bench):
+        return command.out is not None
+    if isinstance(command, Dataset):
+        return command.out is not None
+    return isinstance(command, Train | Calibrate)
 
 
 def parse(arguments: Sequence[str] | None = None) -> Any:
@@ -129,7 +143,7 @@ def _run(
 ) -> int:
     told = getattr(command, "json", False) is True
     silent = told or getattr(command, "quiet", False)
-    heard = Console(quiet=True) if silent else console
+    heard = Console(quiet=True, markup=False) if silent else console
     if isinstance(command, Dataset | Train | Evaluate):
         return _experiment(command, heard)
     if isinstance(command, Calibrate):
@@ -219,6 +233,8 @@ def _check_ways(command: Dress) -> None:
             raise PhysXNetError(
                 f"--budget-ms and --max-error-mm pick the way to dress: leave out --{word}."
             )
+    if command.budget_ms is not None and command.max_error_mm is not None:
+        raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
     if command.accuracy != usual["accuracy"] and command.method != "simulate":
         raise PhysXNetError(
             "--accuracy is the simulator's: add --method simulate, or leave it out."
@@ -260,7 +276,7 @@ def _dress(command: Dress, console: Console, still: pathlib.Path | None = None) 
     if command.character_map is not None and command.character is None:
         raise PhysXNetError("--character-map names joints of --character: add that.")
     if command.quiet or command.json:
-        console = Console(quiet=True)
+        console = Console(quiet=True, markup=False)
     if command.out is None and command.preview is None and still is None:
         console.print(UNWRITTEN)
     with progress_bars(console) as progress:

@@ -38,6 +38,7 @@ def simulate(command: Simulate, console: Console) -> int:
         check_preview(command.preview)
     if command.out is None and command.preview is None and not command.json:
         console.print(UNWRITTEN)
+    _check_engine(command)
     also: list[Effect] = []
     if command.wind is not None:
         also.append(Air(wind=command.wind))
@@ -65,7 +66,7 @@ def simulate(command: Simulate, console: Console) -> int:
     out = command.out or command.preview
     keep = None if out is None else out.with_name(f".{out.name}.unfinished")
     began = time.perf_counter()
-    with progress_bars(Console(quiet=True) if command.json else console) as bars:
+    with progress_bars(Console(quiet=True, markup=False) if command.json else console) as bars:
 
         def progress(done: int, total: int) -> None:
             bars("simulation", done, total)
@@ -89,11 +90,12 @@ def simulate(command: Simulate, console: Console) -> int:
         written = [] if command.out is None else write_clip(command.out, meshes, rollout.fps)
         if command.preview is not None:
             written.append(render_preview(command.preview, meshes, rollout.fps, progress=bars))
+    acting = () if command.engine in ENGINES else scene.effects
     if command.json:
         told = {"notes": list(job.notes), "files": written}
-        print_json(_report(rollout, scene.effects, took) | told)
+        print_json(_report(rollout, acting, took) | told)
         return 0
-    console.print(_summary(rollout, scene.effects, took))
+    console.print(_summary(rollout, acting, took, command.engine))
     for note in job.notes:
         console.print(note, highlight=False, markup=False, soft_wrap=True)
     for path in written:
@@ -101,6 +103,26 @@ def simulate(command: Simulate, console: Console) -> int:
             f"wrote {path} (import at {rollout.fps:g} fps)", highlight=False, soft_wrap=True
         )
     return 0
+
+
+def _check_engine(command: Simulate) -> None:
+    """Fails where an engine would leave out what was asked for."""
+    told = [
+        f"--{name.replace('_', '-')}"
+        for name, value in (
+            ("accuracy", command.accuracy),
+            ("wind", command.wind),
+            ("self_contact", command.self_contact or None),
+        )
+        if value is not None
+    ]
+    if command.engine in ENGINES and told:
+        raise FormatError(
+            f"--engine {command.engine} has forces, contact and an accuracy of its own: leave"
+            f" {', '.join(told)} out."
+        )
+    if command.engine == "bdf2" and command.accuracy is not None:
+        raise FormatError("--accuracy is xpbd's: leave it out, or --engine bdf2.")
 
 
 def _report(rollout: Rollout, effects: tuple[Effect, ...], took: float) -> dict[str, object]:
@@ -163,10 +185,11 @@ _SHOWN = {
 }
 
 
-def _summary(rollout: Rollout, effects: tuple[Effect, ...], took: float) -> Table:
+def _summary(rollout: Rollout, effects: tuple[Effect, ...], took: float, engine: str) -> Table:
     frames = len(rollout.finite)
+    acting = ", ".join(type(e).__name__ for e in effects) or f"forces and contact of {engine}"
     table = Table(
-        title=f"{frames} frames in {took:.1f} s; {', '.join(type(e).__name__ for e in effects)}",
+        title=f"{frames} frames in {took:.1f} s; {acting}",
         title_justify="left",
     )
     table.add_column("over all frames")

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import pathlib
 from typing import Any
 
@@ -74,8 +75,10 @@ def export_dresser(
 
     Raises:
         MissingDependencyError: Without flatbuffers, by which jax writes exports.
-        PhysXNetError: A platform that jax doesn't know.
+        PhysXNetError: A platform that jax doesn't know, or a rate that isn't positive.
     """
+    if not (math.isfinite(fps) and fps > 0):
+        raise PhysXNetError(f"fps is {fps}, expected a positive number.")
     unknown = set(platforms) - set(_PLATFORMS)
     if unknown or not platforms:
         raise PhysXNetError(

@@ -256,8 +256,8 @@ def pick_rung(
             f" {nearest.name}: {cost(nearest):.2f} ms a frame, {error(nearest):.1f} mm."
         )
     told = (
-        f"picked {best.name}: {cost(best):.2f} ms a frame on this machine (calibrated),"
-        f" {error(best):.1f} mm from the simulation on the test actions"
+        f"picked {best.name}: {cost(best):.2f} ms a frame of such templates on this machine"
+        f" (calibrated), {error(best):.1f} mm from the simulation on the test actions"
     )
     better = [r for r in able if error(r) < error(best) - 0.05]
     if better:

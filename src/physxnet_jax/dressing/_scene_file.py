@@ -12,6 +12,7 @@ from ..body import load_body
 from ..errors import FormatError
 from ..files import is_file
 from ..garment import FABRICS, Garment
+from ..io import split_part
 from ..motion import Motion, sudden_turns
 from ..simulation import (
     ACCURACY,
@@ -227,8 +228,9 @@ def made_of(garment: Garment, fabric: str) -> Garment:
 
 def _beside(path: pathlib.Path, word: str) -> str | pathlib.Path:
     there = path.parent / word
-    # A garment may have "=top" behind it.
-    files = (there, path.parent / word.rpartition("=")[0])
+    # A garment may have "#mesh" and "=top" behind it.
+    plain = path.parent / (word.rpartition("=")[0] or word)
+    files = (there, plain, split_part(there)[0], split_part(plain)[0])
     return there if any(map(is_file, files)) else word
 
 

@@ -61,6 +61,8 @@ def make_mesh(
         (1, 3)
     """
     v = np.asarray(vertices, dtype=np.float32)
+    if not np.array_equal(np.asarray(faces, dtype=np.float64), np.asarray(faces, dtype=np.int64)):
+        raise MeshError(f"{name}: faces name fractions of vertices; they are whole numbers.")
     f = np.asarray(faces, dtype=np.int64)
     if v.ndim != 2 or v.shape[1] != 3:
         raise MeshError(f"{name}: vertices have shape {v.shape}, expected [vertices, 3].")
@@ -91,6 +93,9 @@ def make_mesh(
             f"{name}: a corner names uv {tf.min() if tf.min() < 0 else tf.max()}, but there are"
             f" {len(t)} (0 to {len(t) - 1})."
         )
+    if not np.isfinite(t).all():
+        row = int(np.argwhere(~np.isfinite(t).all(axis=1))[0, 0])
+        raise MeshError(f"{name}: uv {row} is not finite ({t[row].tolist()}). Export it again.")
     return TriMesh(
         jnp.asarray(v),
         jnp.asarray(f.astype(np.int32)),

@@ -12,7 +12,11 @@ from ._html import write_html as write_html
 from ._inspect import Inspection as Inspection, inspect_garment as inspect_garment
 from ._mdd import read_mdd as read_mdd, write_mdd as write_mdd
 from ._mend import fit_garment as fit_garment
-from ._mesh_file import GARMENT_FORMATS as GARMENT_FORMATS, read_mesh as read_mesh
+from ._mesh_file import (
+    GARMENT_FORMATS as GARMENT_FORMATS,
+    read_mesh as read_mesh,
+    split_part as split_part,
+)
 from ._obj import read_obj as read_obj, write_obj as write_obj
 from ._pc2 import read_pc2 as read_pc2, write_pc2 as write_pc2
 from ._usd import write_usd as write_usd

@@ -148,7 +148,8 @@ def _look(
         "residual_p99": jnp.sort(residual, axis=0)[int(0.99 * (residual.shape[0] - 1))],
     }
     for e, context in zip(system.effects, contexts, strict=True):
-        info |= e.diagnose(displacement, context)
+        for name, worst in e.diagnose(displacement, context).items():
+            info[name] = jnp.maximum(info[name], worst) if name in info else worst
         stored = e.energy(displacement, context) if energies and e.elastic else None
         if stored is not None:
             info[f"energy_{type(e).__name__.strip('_').lower()}"] = stored

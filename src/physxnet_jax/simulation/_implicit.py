@@ -101,7 +101,8 @@ class Implicit(Solver):
                     x = at[0]
                     slope = free * (mass * (x - goal) + reach * reach * jax.grad(stored)(x))
                     blocks = pattern.assemble(elastic, x, mass, reach)
-                    stiff = pattern.diagonal(blocks, free).mean(axis=(-1, -2)) * 3
+                    block = pattern.diagonal(blocks, free)
+                    stiff = jnp.trace(block, axis1=-2, axis2=-1) / 3
                     return x - free * self._solve(pattern, blocks, free, slope), stiff
 
                 x, stiff = jax.lax.fori_loop(0, self.newton, newton, (x, worst))

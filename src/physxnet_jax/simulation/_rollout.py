@@ -196,7 +196,7 @@ def _roll(
     positions: list[np.ndarray] = []
     diagnostics: list[dict[str, np.ndarray]] = []
     if resume is not None:
-        key = fingerprint(system, rotations, root, (solver, energies))
+        key = fingerprint(system, rotations, root, (solver, energies, fps))
         store = Resume(resume, key)
         state, positions, diagnostics = store.load(state)
     for at in range(ROLLOUT_BLOCK * len(positions), total - 1, ROLLOUT_BLOCK):

@@ -1,6 +1,7 @@
 """What moves, and what it is moved by."""
 
 import dataclasses
+import math
 from typing import Any
 
 import jax
@@ -61,7 +62,8 @@ class System:
                 (stiffnesses), ``friction`` (on the skin).
 
         Raises:
-            SimulationError: Another parameter, or one that no effect of the scene has.
+            SimulationError: Another parameter, one that no effect of the scene has, or a
+                factor that is no positive number (for friction: below zero).
 
         Example:
             ``jax.grad(lambda k: loss(system.rescaled(bend=k)))``
@@ -78,10 +80,25 @@ class System:
                     f"No effect of this scene has {name}, so a factor of it changes nothing. Leave"
                     " it out, or put the effect in."
                 )
+        for name, factor in factors.items():
+            _check_factor(name, factor)
         effects = tuple(e.rescaled(factors) for e in self.effects)
         # What a solver keeps of materials changes with them.
         extra = self.extra.rescaled(effects) if hasattr(self.extra, "rescaled") else self.extra
         return dataclasses.replace(self, effects=effects, extra=extra)
+
+
+def _check_factor(name: str, factor: Any) -> None:
+    """Fails where a factor that is known means nothing; a stiffness of nothing has no slope."""
+    try:
+        known = float(factor)
+    # Of what is traced nothing is known yet.
+    except jax.errors.ConcretizationTypeError:
+        return
+    least = 0.0 if name == "friction" else 1e-9
+    if not least <= known < math.inf:
+        wanted = "a number from 0 up" if name == "friction" else "a positive number"
+        raise SimulationError(f"{name} is {known}, expected {wanted}, or leave the effect out.")
 
 
 def place(

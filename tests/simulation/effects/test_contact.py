@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physxnet_jax.body import NUM_BODY_VERTICES
-from physxnet_jax.garment import template
+from physxnet_jax.garment import free_garment, square_sheet, template
 from physxnet_jax.geometry import closest_points, vertex_normals
 from physxnet_jax.motion import Motion, animate, load_motion
 from physxnet_jax.simulation import (
@@ -16,9 +16,11 @@ from physxnet_jax.simulation import (
     XPBD,
     BodyContact,
     Clock,
+    Gravity,
     Pin,
     Placed,
     Scene,
+    Stretch,
     prepare_scene,
     simulate,
     simulate_still,
@@ -200,3 +202,17 @@ def test_cloth_that_goes_along_with_the_skin_does_not_rub():
         along = gap - jnp.sum(gap * unit, axis=1, keepdims=True) * unit
         assert float(jnp.abs(gap).max()) > 1e-3
         assert (float(jnp.abs(along).max()) > 1e-4) == rubs
+
+
+def test_far_from_the_body_cloth_falls_as_if_there_were_none():
+    """No height counts as limited where nothing limits it: ten metres away, say."""
+    mesh = square_sheet(4, 0.3).mesh
+    sheet = free_garment(np.asarray(mesh.vertices) + [0.0, 14.0, 0.0], np.asarray(mesh.faces))
+    falls = [
+        simulate_still(
+            prepare_scene(Scene((sheet,), effects)), 8, solver=XPBD(8, 1), fps=FPS
+        ).positions[0]
+        for effects in ((Gravity(), Stretch()), (Gravity(), Stretch(), BodyContact()))
+    ]
+    assert falls[0][0, 0, 1] > 12.0 and falls[0][0, 0, 1] - falls[0][-1, 0, 1] > 0.2
+    np.testing.assert_allclose(falls[0], falls[1], atol=1e-5)

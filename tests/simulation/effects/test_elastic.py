@@ -266,3 +266,44 @@ def test_slivers_and_collapsed_triangles_keep_value_and_gradient_finite():
             if e.elastic:
                 value, slope = change(d)
                 assert np.isfinite(float(value)) and np.isfinite(np.asarray(slope)).all()
+
+
+@pytest.mark.parametrize("effect", [Stretch(), Membrane()])
+@pytest.mark.parametrize("apart", [0.0, 1e-10, 1e-7])
+def test_ends_that_coincide_keep_a_finite_gradient_from_sweep_to_sweep(effect, apart):
+    """They have no direction to be parted in: as many sweeps as a frame has must not blow it up."""
+    v = np.array([[0, 0, 0], [0.02, 0, 0], [0, 0, 0.02]], float)
+    e, rest = prepared(effect, free_garment(v, np.array([[0, 1, 2]])))
+    base = jnp.asarray(rest, jnp.float32)[:, :, None]
+    folded = jnp.asarray(rest * apart / 0.02, jnp.float32)[:, :, None] - base
+
+    def swept(d):
+        for _ in range(32):
+            d = e.project(d, d, begun(e, base), jnp.float32(1.0), (0.001, 0.1))
+        return jnp.sum(d**2)
+
+    value, slope = jax.jit(jax.value_and_grad(swept))(folded)
+    assert np.isfinite(float(value)) and np.isfinite(np.asarray(slope)).all()
+    # The control: where there is a direction there is a slope, the differences' own.
+    half = 0.5 * jnp.asarray(rest, jnp.float32)[:, :, None] - base
+    slope = jax.jit(jax.grad(swept))(half)
+    assert np.abs(np.asarray(slope)).max() > 1e-3
+
+
+def test_a_membrane_of_slivers_alone_says_nothing_of_itself():
+    v = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 1e-9, 0]], float)
+    e, rest = prepared(Membrane(), free_garment(v, np.array([[0, 1, 2]])))
+    base = jnp.asarray(rest, jnp.float32)[:, :, None]
+    assert e.diagnose(jnp.zeros_like(base), begun(e, base)) == {}
+
+
+def test_what_two_effects_say_of_strain_is_the_worse_of_both():
+    sheet = square_sheet(4, 0.3, pinned=np.arange(4), fabric=FABRIC)
+    told = {}
+    for effects in ((Stretch(),), (Membrane(),), (Stretch(), Membrane()), (Membrane(), Stretch())):
+        scene = prepare_scene(Scene((sheet,), (Gravity(), *effects, Pin())))
+        info = simulate_still(scene, 3, solver=XPBD(4, 1), fps=30.0).diagnostics
+        told[tuple(type(e).__name__ for e in effects)] = info["strain_max"]
+    both = told["Stretch", "Membrane"]
+    assert (both > 0).any() and not np.array_equal(told["Stretch",], told["Membrane",])
+    np.testing.assert_allclose(both, told["Membrane", "Stretch"], atol=5e-3)

@@ -17,6 +17,30 @@ from .._effect import Clock, Prepared
 
 # What one more loop counts, as a share of all elements: its program is compiled, too.
 _LOOP = 0.12
+# Of its length at rest, below which a span has no direction.
+_COLLAPSED = 1e-4
+
+
+@jax.custom_jvp
+def directed(span: Float[Array, "members 3 batch"], rest: Any) -> Float[Array, "members 3 batch"]:
+    """Spans as they are; a collapsed one has no derivative, as it has no direction.
+
+    Below a ten-thousandth of its length at rest the direction of a span is noise, and what
+    it changes by grows without bound from sweep to sweep.
+
+    Args:
+        span: From one end to the other.
+        rest: Their lengths at rest.
+    """
+    del rest
+    return span
+
+
+@directed.defjvp
+def _directed_jvp(primals: tuple[Array, Any], tangents: tuple[Any, Any]) -> tuple[Array, Array]:
+    (span, rest), (change, _) = primals, tangents
+    length = jnp.sum(span * span, axis=1, keepdims=True)
+    return span, jnp.where(length > (_COLLAPSED * rest) ** 2, change, jnp.zeros_like(change))
 
 
 @pytree

@@ -357,6 +357,8 @@ class _Contact(Prepared):
         high = context.top + progress * context.fall
         slowest = -self.leave * step[0]
         lift = jnp.clip(jnp.clip(height, low, high) - height, slowest, self.push)
+        # Where nothing limits the height nothing holds what is above it.
+        lift = jnp.where(high > 0.9 * _FREE, jnp.maximum(lift, 0.0), lift)
         lift = lift * self.free[..., None]
         moved = displacement + lift * n
         # Friction acts against the skin's own way in this substep.

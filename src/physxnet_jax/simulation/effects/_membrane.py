@@ -12,7 +12,7 @@ from ...errors import check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
-from ._coloured import Coloured, Constraint, Group, colour_group
+from ._coloured import Coloured, Constraint, Group, colour_group, directed
 from ._hinge import sound
 
 
@@ -107,7 +107,7 @@ class _Membrane(Coloured):
         def direction(one: str, two: str, compliance: str) -> Any:
             def c(x: tuple[Array, ...]) -> Constraint:
                 p, q = law[one], law[two]
-                w = p * x[1] + q * x[2]
+                w = directed(p * x[1] + q * x[2], 1.0)
                 length = jnp.sqrt(jnp.sum(w * w, axis=1, keepdims=True) + 1e-18)
                 n = w / length
                 alpha = law[compliance] * jnp.where(length < 1.0, self.softer, 1.0)
@@ -152,6 +152,8 @@ class _Membrane(Coloured):
 
     def diagnose(self, displacement: Array, context: tuple) -> dict[str, Array]:
         g = self.group
+        if not len(g.index[0]):
+            return {}
         x = self._corners([displacement[i] for i in g.index], context[0])
         strain = []
         for one, two in (("u1", "u2"), ("v1", "v2")):

@@ -13,7 +13,7 @@ from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Clock, Effect, Prepared
-from ._coloured import Sheaf, bundled, column, sheaves, sweep
+from ._coloured import Sheaf, bundled, column, directed, sheaves, sweep
 
 
 @dataclasses.dataclass(frozen=True)
@@ -107,7 +107,7 @@ class _Stretch(Prepared):
 
         def move(rows: list[Array], known: tuple) -> list[Array]:
             (da, db), (edge, (wa, wb), rest, compliance) = rows, known
-            span = edge + (db - da)
+            span = directed(edge + (db - da), rest)
             length = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18)
             excess = length - rest
             alpha = compliance * jnp.where(excess < 0, self.softer, 1.0) / (h * h)
