@@ -114,7 +114,6 @@ def test_errors_that_were_evaluated_are_taken_over(tiny, tmp_path):
     assert main([*words, "--errors", str(rows)]) == 2
 
 
-@pytest.mark.slow
 def test_gradients_are_measured_when_asked_for(tiny, tmp_path, hasty):
     out = tmp_path / "net.json"
     words = ["--weights", str(tiny), "--batches", "3", "--garments", "1", "--backward", "--quiet"]

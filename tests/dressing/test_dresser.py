@@ -263,7 +263,6 @@ def test_what_is_told_of_files_is_no_part_of_the_program(dresser):
     assert told.notes == ("a",) and jax.tree.structure(told) == jax.tree.structure(other)
 
 
-@pytest.mark.slow
 def test_people_are_spread_over_devices_by_shard_map(tmp_path):
     """In a process of two devices: one person on each is what one process says of both."""
     code = """
@@ -325,7 +324,6 @@ def test_a_clip_begins_without_a_jump(fps):
         assert jumps(thrown)[:4].max() > 5.0 * now[4:].max()
 
 
-@pytest.mark.slow
 def test_an_export_moves_at_the_rate_that_it_is_for(dresser, motion, tmp_path):
     """Velocities are metres a second: the same poses twice as fast are another cloth."""
     pytest.importorskip("flatbuffers")

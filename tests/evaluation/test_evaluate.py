@@ -118,7 +118,6 @@ def test_the_nearest_frame_of_the_training_set_is_the_frame_itself():
     assert np.abs(known.offsets["bottom"]).max() > 0.02
 
 
-@pytest.mark.slow
 def test_the_pose_network_learns_what_the_pose_decides():
     known = bent()
     frames = training_frames([known], ("bottom",))

@@ -213,7 +213,6 @@ def test_however_it_lies_and_faces_it_is_put_where_the_template_is(name):
         assert how[:4] in told and ("turned" in told) == ("turned" in how) and off < 0.2
 
 
-@pytest.mark.slow
 def test_what_hangs_in_the_air_is_let_down(tmp_path, capsys):
     """A sleeveless top with a wide neck, placed too high, rests on the shoulders in the end."""
     g = template("top")

@@ -525,7 +525,6 @@ print("finite" if bool(jnp.isfinite(found).all()) else "spoiled", float(jnp.abs(
 """
 
 
-@pytest.mark.slow
 def test_slopes_are_finite_however_a_compiler_rounds():
     """Unoptimised programs compute values anew, and the maximum among them is none of them."""
     done = subprocess.run(

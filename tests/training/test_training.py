@@ -229,7 +229,6 @@ def test_differences_along_edges_know_nothing_of_what_all_vertices_share():
             assert float(value) == pytest.approx((1.0 - share) * folded + share * differences)
 
 
-@pytest.mark.slow
 def test_losses_along_edges_and_of_larger_parts_teach(tmp_path):
     model = dataclasses.replace(CONFIG.model, templates=("bottom",))
     config = dataclasses.replace(CONFIG, model=model, adversarial=False, epochs=20)
@@ -393,7 +392,6 @@ def test_either_players_loss_raises_the_alarm_whatever_the_accuracy(loss, value,
     assert seen["gan_alarm"] == alarm
 
 
-@pytest.mark.slow
 def test_bfloat16_learns_nearly_as_fast(tmp_path):
     last = {}
     for precision in ("float32", "bfloat16"):

@@ -103,7 +103,8 @@ def _digest(name: str, command: Evaluate) -> str:
     Nothing for what is none, or isn't at hand.
     """
     if name in ("nearest", "mlp"):
-        return dataset_digest(command.learn_from or command.data)[0][:DIGITS]
+        root = command.learn_from or command.data
+        return dataset_digest(root)[0][:DIGITS] if list_sequences(root) else ""
     try:
         return str(read_card(weights_folder(name.removesuffix("+push")))["sha256"])[:DIGITS]
     except (WeightsError, LookupError):
@@ -132,9 +133,9 @@ def _check_rows(
         )
         for what, then, now in pairs:
             if then and now and then != now:
+                other = "network of that name, or training set" if what == "weights" else what
                 raise PhysXNetError(
-                    f"{out}: {r.method} on {r.action} was measured with another"
-                    f" {'network of that name' if what == 'weights' else 'simulation'}. Name"
+                    f"{out}: {r.method} on {r.action} was measured with another {other}. Name"
                     " another --out, or delete that file."
                 )
 

@@ -92,9 +92,7 @@ def _goes_on(command: object) -> bool:
     if isinstance(command, Simulate):
         here = command.engine in ("xpbd", "bdf2")
         return here and (command.out or command.preview) is not None
-    if isinstance(command, Evaluate | Bench):
-        return command.out is not None
-    if isinstance(command, Dataset):
+    if isinstance(command, Evaluate | Bench | Dataset):
         return command.out is not None
     return isinstance(command, Train | Calibrate)
 

@@ -135,8 +135,7 @@ def write_garment(
 @functools.lru_cache(maxsize=8)
 def _codec(path: pathlib.Path, changed: int) -> Codec:
     data = _archive(path)
-    order, parents, weights = (data[k].astype(np.int64) for k in ("order", "parents", "weights"))
-    return Codec(order, parents, weights)
+    return Codec(*(data[k].astype(np.int64) for k in ("order", "parents", "weights")))
 
 
 def _archive(path: pathlib.Path) -> dict[str, np.ndarray]:

@@ -67,7 +67,8 @@ class ActionError:
         fold_strength: Over that of the reference, see there [1].
         strain_p99_reference: ``strain_p99`` of the reference.
         data: Checksum of the reference's offsets; empty where it wasn't noted.
-        weights: That of the network's weights, likewise.
+        weights: That of the network's weights, likewise; of the dataset that `nearest` and
+            `mlp` learned from.
     """
 
     engine: str
