@@ -20,7 +20,7 @@ physxnet train experiments/configs/local_cpu.py --name local --data runs/ours --
 physxnet train experiments/configs/local_muon_cpu.py --name local-muon --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed --data runs/mixed_extra --data runs/mixed_left_out --data runs/varied --splits train extra --out runs/local-muon
 physxnet train experiments/configs/local_small_cpu.py --name small --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed --data runs/mixed_extra --data runs/mixed_left_out --data runs/varied --splits train extra --out runs/small
 physxnet train experiments/configs/local_nano_cpu.py --name nano --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed --data runs/mixed_extra --data runs/mixed_left_out --data runs/varied --splits train extra --out runs/nano
-physxnet train experiments/configs/local_22_cpu.py --name local-22 --data runs/ours --data runs/mirror --out runs/local-22
+physxnet train experiments/configs/local_22_cpu.py --name local-22 --data runs/ours --out runs/local-22
 physxnet train experiments/configs/paper_cpu.py --name paper --data runs/ours --out runs/paper
 physxnet train experiments/configs/local_cpu.py --name local-wide --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed --data runs/mixed_extra --data runs/mixed_left_out --data runs/varied --data runs/wide --data runs/swift --data runs/varied_left_out --splits train extra --out runs/local-wide
 physxnet dataset build experiments/configs/dataset_taught_a.py --out runs/taught_a

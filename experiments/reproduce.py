@@ -39,9 +39,10 @@ METHODS = (
     "nearest",
     "mlp",
     "runs/local-22",
+    *(f"{n}{way}" for n in ("nano", "small") for way in ("", "+push", "+relax+push", "+mirror")),
     *(
         f"{n}{m}{p}"
-        for n in ("nano", "small", "local", "pair")
+        for n in ("local", "pair")
         for m in ("", "+mirror")
         for p in ("", "+push", "+relax+push")
     ),

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import types
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +12,19 @@ from flax import nnx
 
 from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
-from physxnet_jax.cli._bench_net import _as, _place, _with_errors, engines, floors, points
+from physxnet_jax.cli._bench_net import (
+    _as,
+    _place,
+    _with_errors,
+    engines,
+    floors,
+    markdown,
+    points,
+)
 from physxnet_jax.cli._experiment_commands import Bench
 from physxnet_jax.data import Sequence
-from physxnet_jax.dressing import Cost, mean_errors
+from physxnet_jax.dressing import Cost, mean_errors, present_devices
+from physxnet_jax.dressing._cost import _first_of_each
 from physxnet_jax.evaluation import skinning
 from physxnet_jax.garment import TEMPLATES, template
 from physxnet_jax.io import save_predictor
@@ -222,6 +232,31 @@ def test_an_engine_is_timed_and_drawn_without_an_error():
     assert placed == ["-", "blender", "blender", "blender", "small", "local"]
     solved = [row("simulator", a, 1, 9.0) for a in ("standard", "fine", "noise", "draft")]
     assert [r.size for r in sorted(solved, key=_place)] == ["noise", "draft", "standard", "fine"]
+
+
+def test_rows_of_several_devices_stand_side_by_side():
+    nan = float("nan")
+    rows = [
+        Cost("network", "small", d, b, 1, 9.0, ms, 0.5, 1.0, 9, nan, 0.1, nan)
+        for d, ms in (("H100", 0.1), ("cpu", 3.0))
+        for b in (1, 32)
+    ]
+    table = markdown(rows).splitlines()
+    assert table[0].startswith("| method | size | device | garments |")
+    assert table[2].startswith("| network | small | H100 | 1 | 1 |")
+    assert len({line.count("|") for line in table}) == 1
+    # A line of the picture for each; with one device none is named.
+    assert [p[1] for p in points(rows)] == [
+        f"network, {way}, {d}" for d in ("H100", "cpu") for way in ("live", "32 frames")
+    ]
+    assert "device" not in markdown(rows[:2]) and points(rows[:2])[0][1] == "network, live"
+
+
+def test_every_kind_of_device_is_measured_once():
+    cpu, card, second = (types.SimpleNamespace(device_kind=k) for k in ("cpu", "H100", "H100"))
+    assert _first_of_each([card, second, cpu]) == [card, cpu]
+    assert _first_of_each([cpu, cpu]) == [cpu]
+    assert jax.devices("cpu")[0] in present_devices()
 
 
 def test_a_row_timed_again_has_the_errors_of_its_garments():

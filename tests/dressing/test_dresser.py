@@ -283,6 +283,14 @@ for f, specs in ((move, (each, all_alike)), (move, (all_alike, each)), (wear, (e
     spread = jax.jit(jax.shard_map(f, mesh=mesh, in_specs=specs, out_specs=each))
     gap = jnp.abs(spread(*args) - jax.jit(f)(*wide)).max()
     assert gap < 1e-5, (specs, gap)
+# What is measured on the other device runs there, whatever was made on the first before.
+other = jax.devices()[1]
+with jax.default_device(other):
+    anew = px.make_dresser(["bottom"], weights="nano")
+    there = jax.jit(lambda d, a, b: px.clothe(d, a, b, 30.0)["bottom"])(anew, q[0], p[0])
+assert there.devices() == {other}, there.devices()
+here = px.clothe(dresser, q[0], p[0], 30.0)["bottom"]
+assert np.abs(np.asarray(there) - np.asarray(here)).max() < 1e-5
 print(len(jax.devices()), "devices")
 """
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"

@@ -154,6 +154,36 @@ def test_a_spoiled_frame_is_seen_in_its_window_alone(dresser, judge, motion):
         )
 
 
+def test_float32_is_enough_from_joint_rotations_to_vertices(dresser, motion):
+    """The same numbers in float64: what is between is rounding alone, near and far away."""
+
+    @jax.jit
+    def wear(dresser, q, p):
+        return clothe(dresser, q, p, 30.0).vertices
+
+    def wide(tree):
+        return jax.tree.map(
+            lambda x: jnp.asarray(x, jnp.float64) if x.dtype == jnp.float32 else x, tree
+        )
+
+    for case, most, typical in (
+        (lambda q, p: (q, p), 1e-5, 1e-6),
+        (fast, 1e-3, 3e-5),
+        # Here neighbouring numbers are a quarter of a millimetre apart.
+        (far_away, 1e-2, 1e-3),
+    ):
+        moved = case(*motion)
+        narrow = {k: np.asarray(x) for k, x in wear(dresser, *moved).items()}
+        # What the code makes of its own constants stays float32.
+        with jax.enable_x64(True), jax.numpy_dtype_promotion("standard"):
+            told = {k: np.asarray(x) for k, x in wear(wide(dresser), *wide(moved)).items()}
+        for name, x in told.items():
+            off = np.linalg.norm(narrow[name] - x, axis=-1)
+            # Were it float32 in disguise, nothing would be between.
+            assert x.dtype == np.float64 and 0 < off.max() < most, (name, off.max())
+            assert np.sqrt(np.mean(off**2)) < typical, (name, np.sqrt(np.mean(off**2)))
+
+
 def test_a_spoiled_motion_is_refused_on_the_host(motion):
     q, p = motion
     for bad in (Motion(q, p.at[2].set(jnp.nan), 30.0), Motion(q.at[3, 4].set(jnp.inf), p, 30.0)):

@@ -20,6 +20,7 @@ from ..dressing import (
     network_costs,
     network_errors,
     other_costs,
+    present_devices,
     weights_folder,
 )
 from ..errors import FormatError
@@ -59,33 +60,34 @@ def bench_net(command: Bench, console: Console) -> int:
     jobs: list[tuple[str, str, Precision]] = [("lbs", "-", plain)]
     jobs.extend(("engine" if s in ENGINES else "simulator", s, plain) for s in command.simulator)
     jobs.extend(("network", w, p) for w in command.weights for p in command.precisions)
+    here = present_devices()
+    # Engines run out of process, on the processor.
+    work = [(d, *job) for job in jobs for d in (here[-1:] if job[0] == "engine" else here)]
     with progress_bars(console) as progress:
-        for k, (kind, size, precision) in enumerate(jobs):
-            progress("methods", k, len(jobs))
+        for k, (device, kind, size, precision) in enumerate(work):
+            progress("methods", k, len(work))
             name = pathlib.Path(size).name
+            where = (kind, name, precision, device.device_kind)
             # The rows of a network without and with push-out come together.
-            known = [
-                r
-                for r in rows
-                if (r.method.partition("+")[0], r.size, r.precision) == (kind, name, precision)
-            ]
-            if command.times:
-                # Errors don't change; a method without any isn't measured anew.
-                again = _measure(kind, size, precision, _as(command, known), [], {})
-                there = set(map(_key, known))
-                anew = [r for r in (again if known else ()) if _key(r) in there]
-                rows = [r for r in rows if r not in known]
-                rows += [_with_errors(r, known) for r in anew]
-            else:
-                for some in _missing(command, known) if kind == "network" or not known else ():
-                    rows += list(_measure(kind, size, precision, some, tests, known_errors))
+            known = [r for r in rows if _what(r) == where]
+            with jax.default_device(device):
+                if command.times:
+                    # Errors don't change; a method without any isn't measured anew.
+                    again = _measure(kind, size, precision, _as(command, known), [], {})
+                    there = set(map(_key, known))
+                    anew = [r for r in (again if known else ()) if _key(r) in there]
+                    rows = [r for r in rows if r not in known]
+                    rows += [_with_errors(r, known) for r in anew]
+                else:
+                    for some in _missing(command, known) if kind == "network" or not known else ():
+                        rows += list(_measure(kind, size, precision, some, tests, known_errors))
             # Every method compiles for itself; kept, programs would take all memory maps.
             jax.clear_caches()
             rows.sort(key=_place)
             if command.out is not None:
                 data = [_to_json(r) for r in rows]
                 write_json(command.out, {"machine": machine(), "rows": data})
-        progress("methods", len(jobs), len(jobs))
+        progress("methods", len(work), len(work))
     text = markdown(rows)
     console.print(text, markup=False, highlight=False, soft_wrap=True)
     if command.out is not None:
@@ -96,6 +98,11 @@ def bench_net(command: Bench, console: Console) -> int:
         )
         console.print(f"wrote {command.out}, .md and .png", highlight=False)
     return 0
+
+
+def _what(row: Cost) -> tuple[str, str, str, str]:
+    """What one measurement gives the rows of."""
+    return row.method.partition("+")[0], row.size, row.precision, row.device
 
 
 def _key(row: Cost) -> tuple[str, int, int]:
@@ -141,7 +148,8 @@ def _place(row: Cost) -> tuple[object, ...]:
     place = ("lbs", "simulator", "engine", "network").index(kind)
     # From the coarsest on, as a line through them goes.
     finer = [*ACCURACY].index(row.size) if row.size in ACCURACY else -1
-    return place, row.params, finer, row.size, row.precision, row.method, row.garments, row.batch
+    which = row.size, row.precision, row.device, row.method
+    return place, row.params, finer, *which, row.garments, row.batch
 
 
 def _measure(
@@ -203,6 +211,7 @@ def _evaluated(path: pathlib.Path | None) -> dict[str, dict[Template, float]]:
 def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
     """What is drawn: a panel for each number of garments, a line through a method's sizes."""
     panels = {r.garments for r in rows if r.method.startswith("network")}
+    several = len({r.device for r in rows}) > 1
     out = []
     for r in rows:
         if math.isnan(r.rmse_mm) or (panels and r.garments not in panels) or _is_noise(r):
@@ -212,6 +221,8 @@ def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
         name = f"{name} (paper)" if r.size == "paper" else name
         if r.method.startswith("network"):
             name += ", live" if r.batch == 1 else f", {r.batch} frames"
+        if several:
+            name += f", {r.device}"
         out.append((_panel(r), name, r.rmse_mm, r.ms_per_frame))
     return out
 
@@ -271,12 +282,15 @@ _COLUMNS = (
 
 
 def markdown(rows: list[Cost]) -> str:
-    """One table, a line for each row."""
-    lines = [f"| {' | '.join(_COLUMNS)} |", "|" + "---|" * len(_COLUMNS)]
+    """One table, a line for each row; the device is told where there are several."""
+    several = len({r.device for r in rows}) > 1
+    columns = (*_COLUMNS[:2], *(["device"] if several else []), *_COLUMNS[2:])
+    lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
     for r in rows:
         cells = (
             r.method,
             r.size if r.precision == "float32" else f"{r.size} {r.precision}",
+            *([r.device] if several else []),
             str(r.garments),
             str(r.batch),
             _number(r.rmse_mm, ".1f"),

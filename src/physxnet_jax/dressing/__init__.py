@@ -12,6 +12,7 @@ from ._cost import (
     network_costs as network_costs,
     network_errors as network_errors,
     other_costs as other_costs,
+    present_devices as present_devices,
 )
 from ._dress import (
     METHODS as METHODS,

@@ -34,7 +34,7 @@ class Cost:
     Attributes:
         method: ``lbs``, ``network``, ``network+push``, ``simulator`` or ``engine``.
         size: Name of the weights, the simulator's accuracy or the engine.
-        device: What it ran on.
+        device: Kind of what it ran on.
         batch: Frames a call; 1 is live, a frame in and a frame out.
         garments: Garments worn, in the order top, bottom, dress.
         rmse_mm: Mean over the test actions and these garments [mm]; NaN without data.
@@ -72,6 +72,27 @@ class Cost:
     rmse_each: dict[str, float] = dataclasses.field(default_factory=dict)
 
 
+def present_devices() -> list[jax.Device]:
+    """One device of each kind that there is, JAX's own choice first.
+
+    Example:
+        for device in present_devices():
+            with jax.default_device(device):
+                rows = list(network_costs("small", load_predictor("small"), motion, {}))
+    """
+    return _first_of_each([*jax.local_devices(), *jax.local_devices(backend="cpu")])
+
+
+def _first_of_each(devices: Items[Any]) -> list[Any]:
+    kinds = [d.device_kind for d in devices]
+    return [d for k, d in enumerate(devices) if d.device_kind not in kinds[:k]]
+
+
+def _here() -> jax.Device:
+    """The device that does what isn't told where to run."""
+    return next(iter(jnp.zeros(()).devices()))
+
+
 def network_costs(
     weights: str | pathlib.Path,
     predictor: Predictor,
@@ -83,7 +104,7 @@ def network_costs(
     backward: bool = False,
     precision: Precision = "float32",
 ) -> Iterator[Cost]:
-    """Costs of a network, without and with push-out.
+    """Costs of a network on the default device, without and with push-out.
 
     Args:
         weights: Its name or folder.
@@ -111,7 +132,7 @@ def network_costs(
                 yield Cost(
                     method,
                     size,
-                    jax.devices()[0].device_kind,
+                    _here().device_kind,
                     batch,
                     number,
                     _mean(known, TEMPLATES[:number]),
@@ -140,7 +161,7 @@ def other_costs(
     motion: Motion,
     errors: Mapping[Template, float],
 ) -> Iterator[Cost]:
-    """Costs of a method that dresses one garment at a time: their sums.
+    """Costs of a method that dresses one garment at a time, on the default device: their sums.
 
     Args:
         kind: ``lbs``, ``simulator`` or ``engine``.
@@ -161,7 +182,7 @@ def other_costs(
         yield Cost(
             kind,
             size,
-            jax.devices()[0].device_kind,
+            _here().device_kind,
             BLOCK if kind == "lbs" else 1,
             len(times),
             _mean(errors, TEMPLATES[: len(times)]),

@@ -19,10 +19,11 @@ from ._methods import Method, skinning
 from ._metrics import vertex_error
 from ._motion_metrics import (
     acceleration_error,
+    angle_error,
+    angle_strength,
     area_strain,
-    fold_strength,
+    dihedral_angles,
     jitter,
-    wrinkle_error,
 )
 from ._penetration import penetration
 from ._strain import edge_strain
@@ -218,6 +219,7 @@ class _Reference:
         free = inside.cloth_inside & ~inside.pinched
         faces = np.asarray(assembly.faces)
         strain = np.abs(edge_strain(assembly, x))
+        angles = [dihedral_angles(faces, p) for p in (x, y)]
         values |= {
             "mse_texels_mm2": texels,
             "rmse_texels_mm": texels**0.5,
@@ -233,8 +235,8 @@ class _Reference:
             "area_strain_p99": float(
                 np.quantile(np.abs(area_strain(assembly.rest, faces, x)), 0.99)
             ),
-            "wrinkle_deg": wrinkle_error(faces, x, y),
-            "fold_strength": fold_strength(faces, x) / max(fold_strength(faces, y), 1e-6),
+            "wrinkle_deg": angle_error(*angles),
+            "fold_strength": angle_strength(angles[0]) / max(angle_strength(angles[1]), 1e-6),
             "strain_p99_reference": float(np.quantile(np.abs(edge_strain(assembly, y)), 0.99)),
         }
         # Across a frame that is missing there is no acceleration.

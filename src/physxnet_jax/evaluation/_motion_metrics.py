@@ -11,13 +11,25 @@ def dihedral_angles(
 ) -> Float[np.ndarray, "frames hinges"]:
     """Signed angle between the two triangles of every interior edge [rad]."""
     a, b, left, right = hinges(faces).T
-    x = positions.astype(np.float64)
-    edge = x[:, b] - x[:, a]
-    n1 = np.cross(edge, x[:, left] - x[:, a])
-    n2 = np.cross(x[:, right] - x[:, a], edge)
-    length = np.linalg.norm(edge, axis=2)
-    sine = np.einsum("fhi,fhi->fh", np.cross(n1, n2), edge) / np.maximum(length, 1e-12)
-    return np.arctan2(sine, np.einsum("fhi,fhi->fh", n1, n2))
+    # Number by number and frame by frame: what is between stays in the cache.
+    out = np.empty((len(positions), len(a)))
+    for k, frame in enumerate(np.asarray(positions, np.float64)):
+        x = frame.T
+        edge = x[:, b] - x[:, a]
+        n1 = _cross(edge, x[:, left] - x[:, a])
+        n2 = _cross(x[:, right] - x[:, a], edge)
+        length = np.sqrt(_dot(edge, edge))
+        sine = _dot(_cross(n1, n2), edge) / np.maximum(length, 1e-12)
+        out[k] = np.arctan2(sine, _dot(n1, n2))
+    return out
+
+
+def _cross(a: Float[np.ndarray, "3 n"], b: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
+    return a[[1, 2, 0]] * b[[2, 0, 1]] - a[[2, 0, 1]] * b[[1, 2, 0]]
+
+
+def _dot(a: Float[np.ndarray, "3 n"], b: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, " n"]:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def wrinkle_error(
@@ -29,8 +41,14 @@ def wrinkle_error(
 
     It sees wrinkles that are missing or smoothed away, whatever the mean distance.
     """
-    gap = dihedral_angles(faces, positions) - dihedral_angles(faces, reference)
-    gap = (gap + np.pi) % (2.0 * np.pi) - np.pi
+    return angle_error(dihedral_angles(faces, positions), dihedral_angles(faces, reference))
+
+
+def angle_error(
+    angles: Float[np.ndarray, "frames hinges"], reference: Float[np.ndarray, "frames hinges"]
+) -> float:
+    """`wrinkle_error` of angles that are known [degrees]."""
+    gap = (angles - reference + np.pi) % (2.0 * np.pi) - np.pi
     return float(np.degrees(np.sqrt(np.mean(gap**2))))
 
 
@@ -42,7 +60,12 @@ def fold_strength(
     `wrinkle_error` asks for the same folds in the same places, and is least where there are
     none; this tells whether there are any.
     """
-    return float(np.degrees(np.sqrt(np.mean(dihedral_angles(faces, positions) ** 2))))
+    return angle_strength(dihedral_angles(faces, positions))
+
+
+def angle_strength(angles: Float[np.ndarray, "frames hinges"]) -> float:
+    """`fold_strength` of angles that are known [degrees]."""
+    return float(np.degrees(np.sqrt(np.mean(angles**2))))
 
 
 def area_strain(

@@ -117,8 +117,9 @@ def penetration(
         inside.append(wrong)
         depth.append(np.where(wrong, -lowest, 0.0))
         # Where it is worn: from the nearest skin vertex at rest, over the surface.
-        at = _walk(x, s, around, faces, own)
-        _, weights, face = _height(x, s, normal, faces, around, at)
+        rows = np.flatnonzero(wrong)
+        at = _walk(x[rows], s, around, faces, own[rows])
+        _, weights, face = _height(x[rows], s, normal, faces, around, at)
         foot, up = (np.einsum("pk,pki->pi", weights, a[faces[face]]) for a in (s, normal))
 
         def crowded(
@@ -137,7 +138,9 @@ def penetration(
             crossed = _in_limbs(above, s, normal, limbs, trees, but=segment[at]) < 0
             return crossed | (clear < _CLEAR * room)
 
-        pinched.append(wrong & crowded(foot, up, assembly.thickness, at))
+        narrow = np.zeros(len(x), bool)
+        narrow[rows] = crowded(foot, up, assembly.thickness[rows], at)
+        pinched.append(narrow)
         if clothed is None:
             outside.append(np.nan)
             continue
@@ -269,7 +272,7 @@ def _walk(
 ) -> Int[np.ndarray, " points"]:
     """Along the surface to the skin vertex that has no nearer neighbour."""
     for _ in range(60):
-        ring = faces[around[at]].reshape(len(at), -1)
+        ring = faces[around[at]].reshape(len(at), 3 * around.shape[1])
         gap = s[ring] - x[:, None]
         best = ring[np.arange(len(at)), np.einsum("vki,vki->vk", gap, gap).argmin(axis=1)]
         if (best == at).all():
