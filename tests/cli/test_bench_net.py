@@ -14,7 +14,9 @@ from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
 from physxnet_jax.cli._bench_net import (
     _as,
+    _from_json,
     _place,
+    _to_json,
     _with_errors,
     engines,
     floors,
@@ -22,6 +24,8 @@ from physxnet_jax.cli._bench_net import (
     points,
 )
 from physxnet_jax.cli._experiment_commands import Bench
+from physxnet_jax.cli._machine import machine
+from physxnet_jax.cli._rows import kept_rows, weights_digest
 from physxnet_jax.data import Sequence
 from physxnet_jax.dressing import Cost, mean_errors, present_devices
 from physxnet_jax.dressing._cost import _first_of_each
@@ -197,6 +201,44 @@ def test_panels_are_numbers_of_garments_and_lines_run_through_sizes():
     noisy = [*rows, *(row("simulator", s, 1, 3, 6.0) for s in ("draft", "noise"))]
     assert [p[1] for p in points(noisy)].count("simulator") == 1, "noise is a floor, no point"
     assert floors(noisy) == {"3 garments": 6.0} and floors(rows) == {}
+
+
+def test_rows_of_another_machine_or_of_other_weights_are_not_gone_on_with(tmp_path, capsys):
+    nan = float("nan")
+    row = Cost("network", "nano", "cpu", 1, 1, nan, 1.0, 0.5, 1.0, 9, nan, 0.1, nan)
+    digest = weights_digest("nano")
+    assert len(digest) == 16 and weights_digest("none") == ""
+    words = ["bench", "net", "--weights", "nano", "--times", "--quiet", "--out"]
+    for where, weights, says in (
+        (machine() | {"cores": 96}, digest, "another machine"),
+        (machine(), 16 * "0", "other weights of that name"),
+    ):
+        out = tmp_path / "net.json"
+        rows = [_to_json(dataclasses.replace(row, weights=weights))]
+        out.write_text(json.dumps({"machine": where, "rows": rows}))
+        assert main([*words, str(out)]) == 2
+        assert says in " ".join(capsys.readouterr().err.split())
+    # Nothing was noted in former versions: nothing is compared.
+    for there in ({"machine": machine(), "rows": rows}, {"rows": rows}):
+        out.write_text(json.dumps(there))
+        assert [r.weights for r in kept_rows(out, _from_json)] == [16 * "0"]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["bench", "net", "--out", "/proc/a.json"],
+        ["bench", "sim", "--out", "/proc/a.json"],
+        ["evaluate", "lbs", "--data", "none", "--out", "/proc/a.json"],
+        ["stress", "--out", "/proc/a.json"],
+        ["effects", "walk", "--out", "/proc/a.json"],
+        ["dataset", "check", "none", "--sheet", "/proc/a.png"],
+    ],
+    ids=lambda words: "-".join(words[:2]),
+)
+def test_where_nothing_can_be_written_is_told_before_the_work(words, capsys):
+    assert main(words) == 2
+    assert "nothing can be written there" in " ".join(capsys.readouterr().err.split())
 
 
 def test_what_is_missing_is_said(tmp_path, capsys):

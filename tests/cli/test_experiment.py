@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from physxnet_jax.cli import main
-from physxnet_jax.data import list_sequences, read_log
+from physxnet_jax.data import dataset_digest, list_sequences, read_log
 from physxnet_jax.dressing import EXPORTED
 from physxnet_jax.motion import load_motion, save_motion
 
@@ -37,8 +37,10 @@ def test_build_train_evaluate(tmp_path, capsys):
         (tmp_path / name).write_text(text)
     root, run, out = (str(tmp_path / n) for n in ("set", "run", "errors.json"))
     build = ["dataset", "build", str(tmp_path / "dataset.py"), "--out", root, "--mocap", mocap]
-    assert main([*build, "--only", "run", "--quiet"]) == 0
+    assert main([*build, "--only", "run", "--json"]) == 0
     assert len(list_sequences(root)) == 1 and len(read_log(root)) == 1
+    told = json.loads(capsys.readouterr().out)
+    assert told["simulated"] == 1 and (told["sha256"], told["bytes"]) == dataset_digest(root)
     sheet = tmp_path / "sheet.png"
     check = ["dataset", "check", root, "--mocap", mocap, "--json", "--sheet", str(sheet)]
     capsys.readouterr()

@@ -263,6 +263,8 @@ def test_the_command_chooses_all_that_the_page_does(tmp_path, monkeypatch):
     ]
     assert main(["view", "--live", "--html", str(tmp_path / "a.html")]) == 2
     assert main(["view", "--live", "--method", "lbs"]) == 2
+    assert main(["view", "--compare", "--method", "simulate"]) == 2
+    assert main(["view", "--html", "/proc/a.html"]) == 2
     assert main(["view", "--shape", "weight_up"]) == 2
     assert main(["view", "--shape", "girth=1", "--html", str(tmp_path / "a.html")]) == 2
     assert main(["view", "--fabric", "tin", "--html", str(tmp_path / "a.html")]) == 2

@@ -8,7 +8,6 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from ..errors import FormatError
 from ..evaluation import JITTER, Work, bench_scenes, bench_simulation, time_to_error
 from ..files import whole_file, write_json
 from ..io import load_garment
@@ -16,13 +15,12 @@ from ..motion import load_motion
 from ..viewer import draw_work_precision
 from ._experiment_commands import Bench
 from ._machine import machine
-from ._rows import kept_rows
+from ._rows import check_rows_file, kept_rows
 
 
 def bench(command: Bench, console: Console) -> int:
     """Measures row by row; each is kept as soon as it is there."""
-    if command.out is not None and command.out.suffix != ".json":
-        raise FormatError(f"{command.out}: rows are written as .json.")
+    check_rows_file(command.out)
     shirt = None if command.shirt is None else load_garment(command.shirt)[0]
     action = None if command.motion == "punch" else load_motion(command.motion, fps=30.0)
     scenes = bench_scenes(shirt, action, command.frames)

@@ -35,13 +35,12 @@ from ..viewer import draw_work_precision
 from ._experiment_commands import Bench
 from ._machine import machine
 from ._progress import progress_bars
-from ._rows import kept_rows
+from ._rows import check_rows_file, kept_rows, weights_digest
 
 
 def bench_net(command: Bench, console: Console) -> int:
     """Measures method by method; the rows of each are kept as soon as they are there."""
-    if command.out is not None and command.out.suffix != ".json":
-        raise FormatError(f"{command.out}: rows are written as .json.")
+    check_rows_file(command.out)
     tests: list[Action] = []
     if command.data is not None:
         tests = [read_sequence(f) for f in list_sequences(command.data, "test")]
@@ -56,6 +55,13 @@ def bench_net(command: Bench, console: Console) -> int:
     rows = kept_rows(command.out, _from_json)
     if command.times and not rows:
         raise FormatError("--times measures rows of --out again, and there are none.")
+    digests = {pathlib.Path(w).name: weights_digest(w) for w in command.weights}
+    for r in rows:
+        if r.weights and digests.get(r.size, "") not in ("", r.weights):
+            raise FormatError(
+                f"{command.out}: {r.size} was measured with other weights of that name. Name"
+                " another --out, or delete that file."
+            )
     plain: Precision = "float32"
     jobs: list[tuple[str, str, Precision]] = [("lbs", "-", plain)]
     jobs.extend(("engine" if s in ENGINES else "simulator", s, plain) for s in command.simulator)

@@ -21,7 +21,7 @@ from ..data import (
 )
 from ..errors import FormatError
 from ..evaluation import Finding, check_sequence, network, skinning
-from ..files import whole_file
+from ..files import check_writable, whole_file
 from ..garment import TEMPLATES, Template, template
 from ..io import AnimatedMesh, load_predictor
 from ..motion import Motion
@@ -61,6 +61,8 @@ def _build(command: Dataset, console: Console) -> int:
         f" that is there); {size / 1e6:.1f} MB, sha256 {digest}",
         highlight=False,
     )
+    if command.json:
+        print_json({"sha256": digest, "bytes": size, "simulated": done, "seconds": spent})
     return 0
 
 
@@ -84,6 +86,8 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def _check(command: Dataset, console: Console) -> int:
+    if command.sheet is not None:
+        check_writable(command.sheet)
     root = pathlib.Path(command.target)
     folders = list_sequences(root)
     if not folders:

@@ -12,7 +12,7 @@ from rich.table import Table
 
 from ..data import Sequence, dataset_digest, list_sequences, read_sequence
 from ..dressing import method_by_name, weights_folder
-from ..errors import FormatError, PhysXNetError, WeightsError
+from ..errors import FormatError, PhysXNetError
 from ..evaluation import (
     DIGITS,
     ENGINES,
@@ -28,19 +28,18 @@ from ..evaluation import (
     training_frames,
 )
 from ..files import whole_file, write_json
-from ..io import load_predictor, read_card
+from ..io import load_predictor
 from ..simulation import ACCURACY
 from ..training import usable_garment
 from ..viewer import draw_bars
 from ._experiment_commands import Evaluate
 from ._progress import print_json, progress_bars
-from ._rows import kept_rows
+from ._rows import check_rows_file, kept_rows, weights_digest
 
 
 def evaluate(command: Evaluate, console: Console) -> int:
     """Measures row by row; each is kept as soon as it is there."""
-    if command.out is not None and command.out.suffix != ".json":
-        raise FormatError(f"{command.out}: rows are written as .json.")
+    check_rows_file(command.out)
     folders = list_sequences(command.data, command.split)
     if not folders:
         raise FormatError(f"{command.data}: no '{command.split}' actions; build a dataset first.")
@@ -105,10 +104,7 @@ def _digest(name: str, command: Evaluate) -> str:
     if name in ("nearest", "mlp"):
         root = command.learn_from or command.data
         return dataset_digest(root)[0][:DIGITS] if list_sequences(root) else ""
-    try:
-        return str(read_card(weights_folder(name.removesuffix("+push")))["sha256"])[:DIGITS]
-    except (WeightsError, LookupError):
-        return ""
+    return weights_digest(name)
 
 
 def _check_rows(

@@ -112,7 +112,8 @@ class Dataset:
     sheet: pathlib.Path | None = None
     """check: a contact sheet, .png."""
     json: bool = False
-    """check: print all findings as JSON instead of those out of bounds as a table."""
+    """Print JSON: of check all findings instead of those out of bounds as a table, of build
+    its checksum, size and time."""
     quiet: bool = False
     """Print nothing but errors."""
     debug: bool = False

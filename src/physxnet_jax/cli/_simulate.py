@@ -12,7 +12,7 @@ from ..body import load_body
 from ..dressing import SceneFile, animated_meshes, load_scene, make_scene
 from ..errors import FormatError
 from ..evaluation import ENGINES, price_effects, recommend_effects
-from ..files import write_json
+from ..files import check_writable, write_json
 from ..io import check_output, write_clip
 from ..simulation import (
     ACCURACY,
@@ -206,6 +206,8 @@ def _summary(rollout: Rollout, effects: tuple[Effect, ...], took: float, engine:
 
 def price(command: Effects, console: Console) -> int:
     """Prints the price list of a scene's effects, or what is recommended."""
+    if command.out is not None:
+        check_writable(command.out)
     if _is_scene(command.scene):
         job = _scene_file(command)
     else:

@@ -9,13 +9,15 @@ from rich.table import Table
 
 from ..errors import PhysXNetError
 from ..evaluation import CASES, ENGINES, PEER_CASES, Finding, run_case, run_peer
-from ..files import write_json
+from ..files import check_writable, write_json
 from ._experiment_commands import Stress
 from ._progress import print_json
 
 
 def stress(command: Stress, console: Console) -> int:
     """Runs the cases; 0 if every bound holds, else 1."""
+    if command.out is not None:
+        check_writable(command.out)
     unknown = [c for c in command.cases if c not in CASES]
     if unknown:
         raise PhysXNetError(f"No case {', '.join(unknown)}; there are {', '.join(CASES)}.")

@@ -7,6 +7,7 @@ import webbrowser
 from rich.console import Console
 
 from ..errors import PhysXNetError
+from ..files import check_writable
 from ..viewer import Choice, Viewer, record
 from ._commands import View
 from ._progress import progress_bars
@@ -25,6 +26,10 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         raise PhysXNetError(
             "--live asks the network while the page is open: no --html, no other --method."
         )
+    if command.compare and command.method == "simulate":
+        raise PhysXNetError("--compare sets the simulation beside another --method; leave it out.")
+    if command.html is not None:
+        check_writable(command.html)
     choice = Choice(
         motion=command.motion,
         wear=command.wear,

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..data import Sequence
-from ..evaluation import Method, network, skinning, vertex_error
+from ..evaluation import DIGITS, Method, network, skinning, vertex_error
 from ..garment import TEMPLATES, Template
-from ..io import weights_size
+from ..io import read_card, weights_size
 from ..models import Predictor
 from ..motion import BLOCK, Motion
 from ..training import usable_garment
@@ -51,6 +51,7 @@ class Cost:
         backward_mb: The same of the gradient.
         precision: Of the network's arithmetic.
         rmse_each: The error of each garment worn by template [mm], where there is data.
+        weights: Checksum of the network's weights; empty where it wasn't noted.
     """
 
     method: str
@@ -70,6 +71,7 @@ class Cost:
     backward_mb: float = math.nan
     precision: str = "float32"
     rmse_each: dict[str, float] = dataclasses.field(default_factory=dict)
+    weights: str = ""
 
 
 def present_devices() -> list[jax.Device]:
@@ -121,6 +123,7 @@ def network_costs(
     """
     size = pathlib.Path(weights).name
     params = sum(x.size for x in jax.tree.leaves(predictor.state))
+    digest = str(read_card(weights)["sha256"])[:DIGITS]
     for push_out in (False, True):
         method = "network+push" if push_out else "network"
         for number in garments:
@@ -143,6 +146,7 @@ def network_costs(
                     weights_mb=weights_size(weights) / 1e6,
                     precision=precision,
                     rmse_each=_each(known, TEMPLATES[:number]),
+                    weights=digest,
                 )
 
 

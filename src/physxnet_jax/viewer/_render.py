@@ -258,7 +258,8 @@ def check_preview(path: str | pathlib.Path) -> pathlib.Path:
     path = pathlib.Path(path)
     if path.suffix.lower() not in PREVIEWS:
         raise FormatError(f"{path}: a preview is one of {', '.join(PREVIEWS)}.")
-    if any(importlib.util.find_spec(name) is None for name in ("pyvista", "imageio")):
+    needed = ["pyvista", "imageio", *(["imageio_ffmpeg"] if path.suffix.lower() == ".mp4" else [])]
+    if any(importlib.util.find_spec(name) is None for name in needed):
         raise MissingDependencyError("Pictures need pyvista: pip install 'physxnet-jax[render]'.")
     check_writable(path)
     return path

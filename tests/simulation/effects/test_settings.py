@@ -31,12 +31,21 @@ from physxnet_jax.simulation import (
     prepare_scene,
     simulate_still,
 )
+from physxnet_jax.simulation.blender import BlenderSettings
+from physxnet_jax.simulation.newton import NewtonSettings
 
 NAN, INF = float("nan"), float("inf")
 WRONG = [
     *((Fabric, {k: v}) for k in ("density", "stretch", "warp") for v in (0.0, -1.0, NAN, INF)),
     *((Fabric, {k: v}) for k in ("bend", "thickness", "friction") for v in (-1.0, NAN)),
     (Gravity, {"g": NAN}),
+    (BlenderSettings, {"quality": 0}),
+    (BlenderSettings, {"distance": 1e-4}),
+    (BlenderSettings, {"mass": 0.0}),
+    (BlenderSettings, {"air": NAN}),
+    (NewtonSettings, {"substeps": 2.5}),
+    (NewtonSettings, {"stretch": INF}),
+    (NewtonSettings, {"friction": -0.1}),
     (Damping, {"rate": -5.0}),
     (StrainLimit, {"limit": -0.5}),
     (Seam, {"stiffness": 0.0}),

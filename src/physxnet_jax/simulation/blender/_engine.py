@@ -6,7 +6,7 @@ import pathlib
 import shutil
 from collections.abc import Callable
 
-from ...errors import MissingDependencyError
+from ...errors import MissingDependencyError, check_counts, check_numbers
 from ...motion import Motion
 from .._diagnostics import Rollout
 from .._outside import simulate_outside
@@ -44,6 +44,14 @@ class BlenderSettings:
     air: float = 1.0
     friction: float = 5.0
     mass: float = 0.3
+
+    def __post_init__(self) -> None:
+        check_counts(self, "quality")
+        check_numbers(self, "distance", "mass")
+        check_numbers(self, "tension", "bending", "damping", zero=True)
+        check_numbers(self, "bending_damping", "air", "friction", zero=True)
+        if self.distance < 0.001:
+            raise ValueError(f"distance is {self.distance}; Blender's least is 0.001 m.")
 
 
 def find_blender() -> list[str]:

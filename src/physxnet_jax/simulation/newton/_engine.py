@@ -6,7 +6,7 @@ import pathlib
 import shutil
 from collections.abc import Callable
 
-from ...errors import MissingDependencyError
+from ...errors import MissingDependencyError, check_counts, check_numbers
 from ...motion import Motion
 from .._diagnostics import Rollout
 from .._outside import simulate_outside
@@ -42,6 +42,11 @@ class NewtonSettings:
     contact: float = 1e4
     friction: float = 0.3
     self_collision: bool = False
+
+    def __post_init__(self) -> None:
+        check_counts(self, "substeps", "iterations")
+        check_numbers(self, "density", "stretch", "radius", "contact")
+        check_numbers(self, "bend", "damping", "friction", zero=True)
 
 
 def find_newton() -> list[str]:
