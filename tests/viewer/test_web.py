@@ -17,7 +17,8 @@ from rich.console import Console
 from physxnet_jax.cli import main, parse
 from physxnet_jax.cli._view import view
 from physxnet_jax.errors import FormatError, PhysXNetError
-from physxnet_jax.io import DEFAULT, MIRROR, RELAX, read_obj, split_ways
+from physxnet_jax.garment import template
+from physxnet_jax.io import DEFAULT, MIRROR, RELAX, read_obj, split_ways, write_obj
 from physxnet_jax.motion import procedural_clip, save_motion
 
 pytest.importorskip("viser")
@@ -42,11 +43,11 @@ def test_what_is_chosen_is_what_is_shown(viewer):
     viewer._worn["top"].value = True
     viewer._shapes["weight_up"].value = 0.5
     shown = viewer.wait()
-    assert shown.choice.motion == "balance" and shown.choice.wear == ("top", "bottom")
+    assert shown.choice.motion == "balance" and shown.choice.wear == ("bottom", "top")
     assert shown.choice.shape == (("weight_up", 0.5),)
-    assert [m.name for m in shown.garments] == ["top", "bottom"]
+    assert [m.name for m in shown.garments] == ["bottom", "top"]
     slim = carry_out(Choice("balance", ("bottom",), method="lbs", frames=2, fps=10.0))
-    assert np.ptp(shown.garments[1].positions[0][:, 0]) > np.ptp(
+    assert np.ptp(shown.garments[0].positions[0][:, 0]) > np.ptp(
         slim.garments[0].positions[0][:, 0]
     )
     viewer._shapes["weight_up"].value = 0.0
@@ -61,7 +62,7 @@ def test_what_is_ticked_is_waited_for_before_anybody_asked(viewer, monkeypatch):
     late = threading.Timer(1.0, Viewer.ask, (viewer,))
     monkeypatch.setattr(viewer, "ask", late.start)
     viewer._worn["top"].value = True
-    assert [m.name for m in viewer.wait().garments] == ["top", "bottom"]
+    assert [m.name for m in viewer.wait().garments] == ["bottom", "top"]
     monkeypatch.undo()
     viewer._worn["top"].value = False
     assert viewer.wait().choice == SHORT
@@ -83,6 +84,31 @@ def test_an_error_is_told_and_passes(viewer, tmp_path):
     assert viewer.wait().choice == SHORT
     with pytest.raises(FormatError, match="not a motion"):
         viewer.add_file("a.exe", b"MZ")
+
+
+def test_garments_are_put_on_in_the_order_in_which_they_were_named(tmp_path, monkeypatch):
+    """Of two of one kind the first named is beneath, as `dress` has it; both of one name show."""
+    there, top = [], template("top").mesh
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        there.append(str(tmp_path / folder / "vest.obj"))
+        write_obj(there[-1], np.asarray(top.vertices), np.asarray(top.faces))
+    named = (there[1], "top", there[0])
+
+    def nothing(*_, **__):
+        raise PhysXNetError("nothing")
+
+    # What is chosen is asked here, not what comes of it.
+    monkeypatch.setattr("physxnet_jax.viewer._web.carry_out", nothing)
+    it = Viewer(dataclasses.replace(SHORT, wear=named), port=8131)
+    try:
+        assert it.chosen().wear == named and len(it._worn) == 5
+        it._worn["dress"].value = True
+        assert it.chosen().wear == (*named, "dress")
+        it._worn["top"].value = False
+        assert it.chosen().wear == (there[1], there[0], "dress")
+    finally:
+        it.close()
 
 
 def test_what_a_file_says_is_text_on_the_page(viewer):

@@ -108,9 +108,7 @@ class Viewer:
             source_fps=first.source_fps if known else None,
             skeleton=first.skeleton if known else None,
             joint_map=first.joint_map if known else None,
-            wear=tuple(
-                str(self._files.get(name, name)) for name, box in self._worn.items() if box.value
-            ),
+            wear=self._wear(),
             method=w["method"].value,
             weights="".join((w["weights"].value, *(x for x in (MIRROR, RELAX) if w[x].value))),
             push_out=w["push_out"].value,
@@ -123,6 +121,11 @@ class Viewer:
             self_contact=w["self_contact"].value,
             frames=int(w["frames"].value),
         )
+
+    def _wear(self) -> tuple[str, ...]:
+        """What is ticked, in the order of the command: of two of one kind the first is beneath."""
+        ticked = [str(self._files.get(n, n)) for n, box in self._worn.items() if box.value]
+        return tuple(sorted(ticked, key=[*self._first.wear, *ticked].index))
 
     def ask(self) -> None:
         """Has what is chosen computed."""
@@ -240,8 +243,10 @@ class Viewer:
             for name in dict.fromkeys((*TEMPLATES, *choice.wear)):
                 short = name
                 if name not in TEMPLATES:
-                    short = pathlib.Path(name).name
-                    self._files[short] = pathlib.Path(name)
+                    path = pathlib.Path(name)
+                    # Two files of one name are told apart by where they are.
+                    short = name if path.name in self._files else path.name
+                    self._files[short] = path
                 self._add_garment(short, name in choice.wear)
         with gui.add_folder("Cloth"):
             w["method"] = gui.add_dropdown("method", METHODS, initial_value=choice.method)
