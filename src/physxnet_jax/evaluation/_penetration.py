@@ -94,75 +94,140 @@ def penetration(
             part,
         )
     )
-    around = vertex_faces(faces, NUM_BODY_VERTICES)
-    cloth_around = vertex_faces(assembly.faces, len(assembly.rest))
     home = assembly.rest_body[:NUM_BODY_VERTICES]
     own = _nearest(home, assembly.rest)
-    limbs = _limbs(assembly, faces)
-    segment = body_segments(np.asarray(body.weights)[:NUM_BODY_VERTICES], body)
-    rim = np.zeros(len(assembly.rest), bool)
-    edges = mesh_edges(assembly.faces)
-    rim[edges.vertices[edges.count == 1]] = True
-    outwards = _outwards(assembly, home)
-    clothed = _clothed(assembly, home, rim, outwards, cloth_around) if bare_skin else None
+    build = _Build(
+        faces,
+        vertex_faces(faces, NUM_BODY_VERTICES),
+        body_segments(np.asarray(body.weights)[:NUM_BODY_VERTICES], body),
+        _limbs(assembly, faces),
+    )
+    under = _Covered(assembly, home) if bare_skin else None
     inside, depth, pinched, outside = [], [], [], []
-    for k, x in zip(range(len(looked)), positions[looked]):
-        s = skin[k]
-        normal = np.asarray(vertex_normals(jnp.asarray(s), jnp.asarray(faces)))
-        whole, trees = _tree(s), [_tree(s[limb.vertices]) for limb in limbs]
-        near = _ask(whole, x)
-        height, _, _ = _height(x, s, normal, faces, around, near)
-        lowest = np.minimum(height, _in_limbs(x, s, normal, limbs, trees))
+    for s, x in zip(skin, positions[looked], strict=True):
+        posed = _Skin(build, s)
+        height = posed.height(x, posed.nearest(x))[0]
+        lowest = np.minimum(height, posed.height_in_limbs(x))
         wrong = lowest < 0
         inside.append(wrong)
         depth.append(np.where(wrong, -lowest, 0.0))
         # Where it is worn: from the nearest skin vertex at rest, over the surface.
         rows = np.flatnonzero(wrong)
-        at = _walk(x[rows], s, around, faces, own[rows])
-        _, weights, face = _height(x[rows], s, normal, faces, around, at)
-        foot, up = (np.einsum("pk,pki->pi", weights, a[faces[face]]) for a in (s, normal))
-
-        def crowded(
-            foot: np.ndarray,
-            up: np.ndarray,
-            room: np.ndarray,
-            at: np.ndarray,
-            s: np.ndarray = s,
-            normal: np.ndarray = normal,
-            whole: KDTree = whole,
-            trees: list[KDTree] = trees,
-        ) -> np.ndarray:
-            """Whether there is no place at this height above skin."""
-            above = foot + room[:, None] * up
-            clear, _, _ = _height(above, s, normal, faces, around, _ask(whole, above))
-            crossed = _in_limbs(above, s, normal, limbs, trees, but=segment[at]) < 0
-            return crossed | (clear < _CLEAR * room)
-
+        at = _walk(x[rows], s, build.around, faces, own[rows])
+        foot, up = posed.foot(x[rows], at)
         narrow = np.zeros(len(x), bool)
-        narrow[rows] = crowded(foot, up, assembly.thickness[rows], at)
+        narrow[rows] = posed.crowded(foot, up, assembly.thickness[rows], at)
         pinched.append(narrow)
-        if clothed is None:
-            outside.append(np.nan)
-            continue
+        outside.append(np.nan if under is None else under.bare(posed, x))
+    return Penetration(np.stack(inside), np.stack(depth), np.stack(pinched), np.asarray(outside))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Build:
+    """What of the skin is the same in every frame."""
+
+    faces: Int[np.ndarray, "faces 3"]
+    around: Int[np.ndarray, "body k"]
+    segment: Int[np.ndarray, " body"]
+    limbs: "list[_Limb]"
+
+
+class _Skin:
+    """The skin of one frame, and what is asked of it."""
+
+    def __init__(self, build: _Build, vertices: Float[np.ndarray, "body 3"]) -> None:
+        self._build, self.vertices = build, vertices
+        self.normals = np.asarray(vertex_normals(jnp.asarray(vertices), jnp.asarray(build.faces)))
+        self._whole = _tree(vertices)
+        self._trees = [_tree(vertices[limb.vertices]) for limb in build.limbs]
+
+    def nearest(self, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
+        return _ask(self._whole, points)
+
+    def height(
+        self, points: Float[np.ndarray, "points 3"], near: Int[np.ndarray, " points"]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`_height` over the triangles around these vertices."""
+        build = self._build
+        return _height(points, self.vertices, self.normals, build.faces, build.around, near)
+
+    def foot(
+        self, points: Float[np.ndarray, "points 3"], near: Int[np.ndarray, " points"]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The closest points around these vertices [m], and the normals there."""
+        _, weights, face = self.height(points, near)
+        corners = self._build.faces[face]
+        foot, up = (
+            np.einsum("pk,pki->pi", weights, a[corners]) for a in (self.vertices, self.normals)
+        )
+        return foot, up
+
+    def height_in_limbs(
+        self,
+        points: Float[np.ndarray, "points 3"],
+        *,
+        but: Int[np.ndarray, " points"] | None = None,
+    ) -> Float[np.ndarray, " points"]:
+        """Least height over any limb's skin [m], at most 0; not over the segment ``but``."""
+        x, s, normal = points, self.vertices, self.normals
+        out = np.zeros(len(x))
+        for limb, tree in zip(self._build.limbs, self._trees, strict=True):
+            rows = np.arange(len(x)) if but is None else np.flatnonzero(but != limb.segment)
+            far, near = map(np.asarray, tree.query(x[rows], distance_upper_bound=limb.thick))
+            rows, near = rows[np.isfinite(far)], limb.vertices[near[np.isfinite(far)]]
+            # Only points beneath the nearest vertex's plane, or nearly, can be inside.
+            under = np.einsum("pi,pi->p", x[rows] - s[near], normal[near]) < _CURVED
+            rows, near = rows[under], near[under]
+            if not len(rows):
+                continue
+            height, weights, face = _height(x[rows], s, normal, limb.faces, limb.around, near)
+            at_end = (weights * limb.rim[limb.faces[face]]).sum(axis=1) > 0.999
+            out[rows] = np.minimum(out[rows], np.where(at_end, 0.0, height))
+        return out
+
+    def crowded(
+        self,
+        foot: Float[np.ndarray, "points 3"],
+        up: Float[np.ndarray, "points 3"],
+        room: Float[np.ndarray, " points"],
+        at: Int[np.ndarray, " points"],
+    ) -> Bool[np.ndarray, " points"]:
+        """Whether there is no place at this height above these points of the skin."""
+        above = foot + room[:, None] * up
+        clear = self.height(above, self.nearest(above))[0]
+        crossed = self.height_in_limbs(above, but=self._build.segment[at]) < 0
+        return crossed | (clear < _CLEAR * room)
+
+
+class _Covered:
+    """The skin that wears cloth at rest, and how much of it shows."""
+
+    def __init__(self, assembly: Assembly, home: Float[np.ndarray, "body 3"]) -> None:
+        self._assembly, self._home = assembly, home
+        self._around = vertex_faces(assembly.faces, len(assembly.rest))
+        self._rim = np.zeros(len(assembly.rest), bool)
+        edges = mesh_edges(assembly.faces)
+        self._rim[edges.vertices[edges.count == 1]] = True
+        self._outwards = _outwards(assembly, home)
+        self._clothed = _clothed(assembly, home, self._rim, self._outwards, self._around)
+
+    def bare(self, skin: _Skin, x: Float[np.ndarray, "vertices 3"]) -> float:
+        """Share of it that sticks out of the cloth."""
+        faces, s = self._assembly.faces, skin.vertices
         under = _nearest(x, s)
         # Only cloth that is worn on that skin: a hand beside the hip is no hole in it.
-        worn = np.linalg.norm(assembly.rest[under] - home, axis=1) < _UNDER
-        covered = np.flatnonzero(worn & clothed)
-        cloth_normal = np.asarray(
-            vertex_normals(jnp.asarray(x, jnp.float32), jnp.asarray(assembly.faces))
-        )
-        cloth_normal = cloth_normal * outwards[:, None]
-        up, weights, face = _height(
-            s[covered], x, cloth_normal, assembly.faces, cloth_around, under[covered]
-        )
+        worn = np.linalg.norm(self._assembly.rest[under] - self._home, axis=1) < _UNDER
+        covered = np.flatnonzero(worn & self._clothed)
+        normal = np.asarray(vertex_normals(jnp.asarray(x, jnp.float32), jnp.asarray(faces)))
+        normal = normal * self._outwards[:, None]
+        up, weights, face = _height(s[covered], x, normal, faces, self._around, under[covered])
         # A foot on the hem is beside the cloth, not beneath it.
-        beside = ((weights * rim[assembly.faces[face]]).sum(axis=1)) > 0.999
-        sticks = (up > 1e-4) & ~beside
-        bare = covered[sticks]
-        seen = ~crowded(s[bare], normal[bare], np.full(len(bare), _THIN), bare)
-        seen &= ~_under_cloth(s[bare], normal[bare], x, assembly.faces)
-        outside.append(seen.sum() / max(len(covered), 1))
-    return Penetration(np.stack(inside), np.stack(depth), np.stack(pinched), np.asarray(outside))
+        beside = ((weights * self._rim[faces[face]]).sum(axis=1)) > 0.999
+        bare = covered[(up > 1e-4) & ~beside]
+        room = np.full(len(bare), _THIN)
+        seen = ~skin.crowded(s[bare], skin.normals[bare], room, bare)
+        seen &= ~_under_cloth(s[bare], skin.normals[bare], x, faces)
+        return seen.sum() / max(len(covered), 1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,32 +257,6 @@ def _limbs(assembly: Assembly, faces: Int[np.ndarray, "faces 3"]) -> list[_Limb]
         axes = np.linalg.svd(x - x.mean(axis=0), full_matrices=False)[2]
         width = np.ptp(x @ axes.T, axis=0)[2]
         out.append(_Limb(int(k), vertices, mine, around, rim, 0.5 * float(width)))
-    return out
-
-
-def _in_limbs(
-    x: Float[np.ndarray, "points 3"],
-    s: Float[np.ndarray, "body 3"],
-    normal: Float[np.ndarray, "body 3"],
-    limbs: list[_Limb],
-    trees: list[KDTree],
-    *,
-    but: Int[np.ndarray, " points"] | None = None,
-) -> Float[np.ndarray, " points"]:
-    """Least height over any limb's skin, at most 0; not over the segment ``but``."""
-    out = np.zeros(len(x))
-    for limb, tree in zip(limbs, trees, strict=True):
-        rows = np.arange(len(x)) if but is None else np.flatnonzero(but != limb.segment)
-        far, near = map(np.asarray, tree.query(x[rows], distance_upper_bound=limb.thick))
-        rows, near = rows[np.isfinite(far)], limb.vertices[near[np.isfinite(far)]]
-        # Only points beneath the nearest vertex's plane, or nearly, can be inside.
-        under = np.einsum("pi,pi->p", x[rows] - s[near], normal[near]) < _CURVED
-        rows, near = rows[under], near[under]
-        if not len(rows):
-            continue
-        height, weights, face = _height(x[rows], s, normal, limb.faces, limb.around, near)
-        at_end = (weights * limb.rim[limb.faces[face]]).sum(axis=1) > 0.999
-        out[rows] = np.minimum(out[rows], np.where(at_end, 0.0, height))
     return out
 
 
