@@ -160,3 +160,7 @@ def test_normals_of_a_box_know_nothing_of_its_diagonals():
 def test_the_longest_border_comes_first():
     faces = np.array([[0, 1, 2], [3, 4, 5], [3, 5, 6]])
     assert [sorted(x.tolist()) for x in boundary_loops(faces)] == [[3, 4, 5, 6], [0, 1, 2]]
+    # Two triangles that share a corner: one loop that passes it twice, wherever it begins.
+    for bow in ([[0, 1, 2], [0, 3, 4]], [[2, 0, 1], [3, 4, 0]], [[1, 2, 0], [4, 0, 3]]):
+        (loop,) = boundary_loops(np.array(bow))
+        assert sorted(loop.tolist()) == [0, 0, 1, 2, 3, 4]

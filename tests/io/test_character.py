@@ -13,7 +13,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from physxnet_jax.errors import FormatError, PhysXNetError
-from physxnet_jax.io import AnimatedMesh, read_character, read_pc2, write_clip, write_obj, write_pc2
+from physxnet_jax.io import (
+    AnimatedMesh,
+    read_character,
+    read_mesh,
+    read_pc2,
+    write_clip,
+    write_obj,
+    write_pc2,
+)
 from physxnet_jax.io._moving import Moving, welded
 from physxnet_jax.motion import body_animation, procedural_clip
 
@@ -210,6 +218,134 @@ def test_a_skin_that_does_not_fit_is_refused(tmp_path):
         read_character(skinned(tmp_path / "b.glb", turn=turn, scale=1.0, joints_of=[1, 77]))
 
 
+def shaped(path, *, sparse=False, mesh_weights=None, node_weights=None):
+    """A figure with one morph target, that lifts its head by half a metre."""
+    path = pathlib.Path(path)
+    lifted = np.zeros((5, 3), np.float32)
+    lifted[2:4, 1] = 0.5
+    parts = [POINTS, FACES.reshape(-1).astype(np.uint16)]
+    if sparse:
+        parts += [np.array([2, 3], np.uint16), lifted[2:4]]
+    else:
+        parts += [lifted]
+    blob, views = b"", []
+    for part in parts:
+        blob += b"\0" * (-len(blob) % 4)
+        views.append({"buffer": 0, "byteOffset": len(blob), "byteLength": part.nbytes})
+        blob += part.tobytes()
+    target = {"componentType": 5126, "count": 5, "type": "VEC3"}
+    if sparse:
+        target["sparse"] = {
+            "count": 2,
+            "indices": {"bufferView": 2, "componentType": 5123},
+            "values": {"bufferView": 3},
+        }
+    else:
+        target["bufferView"] = 2
+    mesh = {
+        "primitives": [{"attributes": {"POSITION": 0}, "indices": 1, "targets": [{"POSITION": 2}]}]
+    }
+    node = {"name": "figure", "mesh": 0}
+    if mesh_weights is not None:
+        mesh["weights"] = mesh_weights
+    if node_weights is not None:
+        node["weights"] = node_weights
+    told = {
+        "asset": {"version": "2.0"},
+        "scenes": [{"nodes": [0]}],
+        "nodes": [node],
+        "meshes": [mesh],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 5, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5123, "count": 12, "type": "SCALAR"},
+            target,
+        ],
+        "bufferViews": views,
+        "buffers": [{"byteLength": len(blob)}],
+    }
+    if path.suffix == ".gltf":
+        path.with_suffix(".bin").write_bytes(blob)
+        told["buffers"][0]["uri"] = path.with_suffix(".bin").name
+        path.write_text(json.dumps(told))
+        return path
+    text = json.dumps(told).encode()
+    text += b" " * (-len(text) % 4)
+    blob += b"\0" * (-len(blob) % 4)
+    chunks = struct.pack("<2I", len(text), 0x4E4F534A) + text
+    chunks += struct.pack("<2I", len(blob), 0x004E4942) + blob
+    path.write_bytes(struct.pack("<3I", 0x46546C67, 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".gltf", ".glb"])
+@pytest.mark.parametrize("sparse", [False, True])
+def test_shape_keys_count_where_nothing_moves_them(tmp_path, suffix, sparse):
+    """Those of the node before those of its mesh; morph targets may be stored sparse."""
+    for mesh_weights, node_weights, height in (
+        (None, None, 1.7),
+        ([0.0], None, 1.7),
+        ([1.0], None, 2.2),
+        ([1.0], [0.5], 1.95),
+        (None, [1.0], 2.2),
+    ):
+        weights = {"mesh_weights": mesh_weights, "node_weights": node_weights}
+        path = shaped(tmp_path / f"a{suffix}", sparse=sparse, **weights)
+        for mesh in (read_character(path)[0].positions[0], read_mesh(path).vertices):
+            assert np.ptp(mesh[:, 1]) == pytest.approx(height, abs=1e-5), weights
+    with pytest.raises(FormatError, match="morph targets"):
+        read_character(shaped(tmp_path / f"b{suffix}", mesh_weights=[1.0, 2.0]))
+
+
+def test_a_sparse_place_that_is_not_there_is_refused(tmp_path):
+    path = shaped(tmp_path / "a.gltf", sparse=True, mesh_weights=[1.0])
+    whole = json.loads(path.read_text())
+    for change, says in (
+        ({"count": 9}, "sparse in 9 places"),
+        ({"count": 0}, "sparse in 0 places"),
+        (
+            {"indices": {"bufferView": 0, "byteOffset": 12, "componentType": 5123}},
+            "places that it hasn't",
+        ),
+        ({"indices": {"bufferView": 0, "componentType": 5126}}, "places that it hasn't"),
+        ({"values": {"bufferView": 2}}, "reaches past view 2"),
+    ):
+        told = json.loads(path.read_text())
+        told["accessors"][2]["sparse"] |= change
+        path.write_text(json.dumps(told))
+        with pytest.raises(PhysXNetError, match=says):
+            read_character(path)
+        path.write_text(json.dumps(whole))
+    del whole["accessors"][2]["sparse"]
+    path.write_text(json.dumps(whole))
+    with pytest.raises(PhysXNetError, match="no values"):
+        read_character(path)
+
+
+@pytest.mark.parametrize("seconds", [False, True], ids=["frames", "seconds"])
+@pytest.mark.parametrize("ranged", [False, True], ids=["silent", "ranged"])
+def test_a_stage_is_read_by_its_samples_whatever_it_counts_in(tmp_path, seconds, ranged):
+    """A second in 25 samples: of one time code each, or within one; with a range or without."""
+    from pxr import Usd, UsdGeom, Vt
+
+    stage = Usd.Stage.CreateNew(str(tmp_path / "a.usda"))
+    stage.SetTimeCodesPerSecond(1 if seconds else 24)
+    mesh = UsdGeom.Mesh.Define(stage, "/figure")
+    mesh.CreateFaceVertexCountsAttr([3] * 4)
+    mesh.CreateFaceVertexIndicesAttr(FACES.reshape(-1).tolist())
+    points = mesh.CreatePointsAttr()
+    sway = 0.3 * np.sin(np.arange(25) / 4)
+    for k, x in enumerate(sway):
+        moved = (POINTS + [x, 0, 0]).astype(np.float32)
+        points.Set(Vt.Vec3fArray.FromNumpy(moved), k / 24 if seconds else k)
+    if ranged:
+        stage.SetStartTimeCode(0)
+        stage.SetEndTimeCode(1 if seconds else 24)
+    stage.Save()
+    found = read_character(tmp_path / "a.usda", fps=24.0)[0].positions
+    assert len(found) == 25
+    np.testing.assert_allclose(found[:, :, 0].min(axis=1), sway, atol=1e-5)
+
+
 def test_a_usd_skin_is_baked(tmp_path):
     from pxr import Gf, Usd, UsdGeom, UsdSkel, Vt
 
@@ -246,7 +382,8 @@ def test_a_usd_skin_is_baked(tmp_path):
     api.CreateJointWeightsPrimvar(False, 1).Set([1.0] * 5)
     assert root
     stage.Save()
-    found = read_character(tmp_path / "a.usda", fps=10.0)[0]
+    found, bind, _ = read_character(tmp_path / "a.usda", fps=10.0)
+    np.testing.assert_allclose(np.sort(bind, axis=0), np.sort(POINTS, axis=0), atol=1e-5)
     expected = np.stack([POINTS, POINTS + [0.1, 0, 0]])
     np.testing.assert_allclose(found.positions, expected, atol=1e-5)
 

@@ -10,14 +10,26 @@ import jax.numpy as jnp
 import numpy as np
 import pygltflib
 import pytest
+from scipy.spatial.transform import Rotation
 
 from physxnet_jax import inspect_motion
 from physxnet_jax.cli import main
 from physxnet_jax.errors import MotionError
-from physxnet_jax.motion import JOINT_MAPS, load_motion, procedural_clip, save_motion
+from physxnet_jax.motion import (
+    JOINT_MAPS,
+    load_motion,
+    procedural_clip,
+    read_bvh,
+    retarget,
+    save_motion,
+    sudden_turns,
+)
+from physxnet_jax.motion._inspect import _skeleton
 
 _TESTS = pathlib.Path(__file__).parent
 _write_gltf = runpy.run_path(str(_TESTS / "test_gltf_motion.py"))["write_gltf"]
+# As far as a limb may turn in a frame of 60 a second, and no more.
+TURN = Rotation.from_rotvec([0.0, 0.0, 0.6])
 bvh = runpy.run_path(str(_TESTS / "test_skeletons.py"))["bvh"]
 
 
@@ -90,6 +102,50 @@ def test_a_limb_that_turns_over_is_named(walk, body, tmp_path):
     save_motion(tmp_path / "a.npz", dataclasses.replace(walk, rotations=jnp.asarray(turns)))
     (problem,) = inspect_motion(tmp_path / "a.npz").problems
     assert problem.startswith("LeftUpLeg turns by 1") and "from frame 69 to 70" in problem
+
+
+def test_what_turns_over_between_two_frames_as_dressed_is_told_of_in_faster_files(
+    walk, body, tmp_path
+):
+    """Two frames of 60 a second are one of 30: half of the turn in each."""
+    fast = load_motion("walk", fps=60.0)
+    j = body.joint("LeftArm")
+    turns = np.asarray(fast.rotations).copy()
+    turns[70:, j] = (Rotation.from_quat(turns[70:, j], scalar_first=True) * TURN**2).as_quat(
+        scalar_first=True
+    )
+    turns[69, j] = (Rotation.from_quat(turns[69, j], scalar_first=True) * TURN).as_quat(
+        scalar_first=True
+    )
+    path = tmp_path / "a.npz"
+    save_motion(path, dataclasses.replace(fast, rotations=jnp.asarray(turns, jnp.float32)))
+    (problem,) = inspect_motion(path).problems
+    assert "LeftArm turns by" in problem and problem.endswith("(frames of 30 a second).")
+    assert sudden_turns(body, load_motion(path)) is None
+
+
+def test_axes_of_rest_and_motion_may_differ(body, rest, walk, tmp_path):
+    """A rest pose along Z beside frames along Y is turned alone; the other way is told of."""
+    y, z = walk, Rotation.from_euler("X", 90.0, degrees=True)
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(body, rest, y, JOINT_MAPS["mixamo"]))
+    usual = load_motion(path)
+    source = read_bvh(path)
+    for rest_turned, frames_turned in ((True, False), (False, True)):
+        turn, still = z.as_matrix(), np.eye(3)
+        a, b = (turn if rest_turned else still), (turn if frames_turned else still)
+        changed = dataclasses.replace(
+            source,
+            offsets=source.offsets @ a.T,
+            rotations=b @ source.rotations @ a.T,
+            root=source.root @ b.T,
+        )
+        clip = retarget(changed, body)
+        note = _skeleton(changed, None, body, rest).lies
+        if rest_turned:
+            np.testing.assert_allclose(clip.rotations, usual.rotations, atol=1e-4)
+            np.testing.assert_allclose(clip.root, usual.root, atol=1e-4)
+        assert note == frames_turned
 
 
 def test_a_map_of_ones_own_is_in_the_command(body, rest, walk, tmp_path):

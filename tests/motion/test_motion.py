@@ -174,6 +174,49 @@ def test_a_person_of_another_shape_stands_as_straight(body):
     assert np.abs(ours - usual)[legs].max() > 5e-3
 
 
+def test_a_saved_motion_stands_on_the_floor_in_another_shape(body, tmp_path):
+    save_motion(tmp_path / "w.npz", load_motion("walk", fps=10))
+    usual = load_motion(tmp_path / "w.npz")
+    for shape in (body.shape(height_up=1.0), body.shape(height_down=1.0)):
+        rest = body.rest_vertices(shape)
+        assert abs(foot_heights(body, usual, rest).min()) > 0.02, "as it is it sinks, or floats"
+        clip = load_motion(tmp_path / "w.npz", shape=shape)
+        assert abs(foot_heights(body, clip, rest).min()) < 1e-5
+        np.testing.assert_array_equal(clip.root[:, ::2], usual.root[:, ::2])
+
+
+def amass(path, pose, way, *, height=0.0, steps=60):
+    """Somebody in this pose who goes this way [m], so far above the plane of z = 0."""
+    t = np.linspace(0.0, 1.0, steps)[:, None]
+    poses = np.zeros((steps, 66))
+    poses[:, :3] = pose.as_rotvec()
+    np.savez(path, poses=poses, trans=way * t + [0, 0, height], mocap_framerate=60.0)
+    return path
+
+
+@pytest.mark.parametrize("degrees", [0.0, 90.0, 180.0, 270.0])
+def test_who_crawls_in_a_file_of_amass_lies_whichever_way(body, rest, tmp_path, degrees):
+    """Z is up there: prone, with the head along the floor."""
+    heading = Rotation.from_euler("z", degrees, degrees=True)
+    prone = heading * Rotation.from_euler("x", 170.0, degrees=True)
+    ahead = prone.apply([0.0, 1.0, 0.0])
+    clip = load_motion(amass(tmp_path / "a.npz", prone, 0.5 * ahead * [1, 1, 0], height=0.2))
+    world, _ = clip_transforms(body, rest, clip)
+    np.testing.assert_allclose(
+        world[0, 0] @ [0.0, 1.0, 0.0], ahead[[0, 2, 1]] * [1, 1, -1], atol=0.02
+    )
+    assert np.ptp(np.asarray(clip.root)[:, 1]) < 0.15
+
+
+def test_files_of_the_layout_of_amass_may_have_y_up(body, rest, tmp_path):
+    """Standing, walking, and on the stairs: no floor along Z is taken for one."""
+    upright = Rotation.identity()
+    for way in ([0.0, 0, 0], [0.0, 0, 1.5], [1.0, 0.6, 0.4]):
+        clip = load_motion(amass(tmp_path / "a.npz", upright, np.array(way)))
+        world, _ = clip_transforms(body, rest, clip)
+        assert world[0, 0, 1, 1] > 0.98, way
+
+
 @pytest.mark.parametrize(
     ("name", "told", "says"),
     [

@@ -30,7 +30,9 @@ def skin(motion):
 def test_the_skin_of_a_mirrored_motion_is_the_mirrored_skin():
     body = load_body()
     motion = load_motion("punch", fps=30.0)
-    motion = dataclasses.replace(motion, rotations=motion.rotations[::9], root=motion.root[::9])
+    # Thumbs are bent by hand: no file of motion does it.
+    bent = motion.rotations.at[:, body.joint("LThumb")].set(jnp.array([0.9211, 0.0, 0.0, -0.3894]))
+    motion = dataclasses.replace(motion, rotations=bent[::9], root=motion.root[::9])
     rest = np.asarray(body.rest_vertices(body.default_shape()))[:NUM_BODY_VERTICES]
     away, pair = KDTree(rest).query(rest * [-1, 1, 1])
     assert np.quantile(away, 0.99) < 2e-3, "the body is the same on both sides"
@@ -38,7 +40,7 @@ def test_the_skin_of_a_mirrored_motion_is_the_mirrored_skin():
     seen = skin(mirrored(body, motion))
     want = skin(motion)[:, pair] * np.float32([-1, 1, 1])
     gap = np.linalg.norm(seen - want, axis=2)[:, good]
-    assert np.quantile(gap, 0.99) < 5e-3
+    assert np.quantile(gap, 0.99) < 5e-3 and gap.max() < 0.02
     # A punch with one arm: without the mirror it is another motion.
     assert np.linalg.norm(seen - skin(motion), axis=2).max() > 0.3
 

@@ -9,7 +9,10 @@ from ..geometry import hinges
 def dihedral_angles(
     faces: Int[np.ndarray, "faces 3"], positions: Float[np.ndarray, "frames vertices 3"]
 ) -> Float[np.ndarray, "frames hinges"]:
-    """Signed angle between the two triangles of every interior edge [rad]."""
+    """Angle between the two triangles of every interior edge [rad].
+
+    Its sign tells a fold from its opposite at the same edge, not a ridge from a valley.
+    """
     a, b, left, right = hinges(faces).T
     # Number by number and frame by frame: what is between stays in the cache.
     out = np.empty((len(positions), len(a)))

@@ -13,8 +13,8 @@ def safe_normalize(
 ) -> Float[Array, "*batch n"]:
     """Unit vectors along the last axis; the zero vector stays zero.
 
-    Value and gradient are finite everywhere: below ``eps`` the division is by
-    ``eps`` and the norm isn't differentiated.
+    Value and gradient are finite everywhere: what is no longer than ``eps`` becomes zero,
+    and so does its gradient.
 
     Args:
         vectors: Any vectors.
@@ -91,9 +91,10 @@ def polar_rotation(
 ) -> Float[Array, "*batch 3 3"]:
     """Nearest rotation of blended rotation matrices, by Newton-Schulz iteration.
 
-    Converges where every singular value lies in (0, sqrt(3)): true for convex
-    blends of rotations, except blends of opposite ones, which stay singular and
-    finite (no division, no square root: no NaN in value or gradient).
+    Converges where every singular value lies in (0, sqrt(3)), to a rotation if the
+    determinant is positive: true for blends of two rotations, except opposite ones, which stay
+    singular and finite (no division, no square root: no NaN in value or gradient). Of
+    three that are far apart the determinant may be negative; the result is a reflection then.
 
     Args:
         matrices: Convex combinations of rotation matrices.

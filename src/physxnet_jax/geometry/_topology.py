@@ -75,22 +75,30 @@ def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " 
         following.setdefault(int(a), []).append(int(b))
     loops = []
     while following:
-        start = next(iter(following))
-        loop = [start]
-        at = start
-        while True:
-            nexts = following.get(at)
-            if not nexts:
-                break
-            step = nexts.pop()
-            if not nexts:
-                del following[at]
-            if step == start:
-                break
-            loop.append(step)
-            at = step
+        loop = _chain(next(iter(following)), following)
+        k = 0
+        while k < len(loop):
+            # What else begins and ends here is gone round on the way.
+            if loop[k] in following:
+                loop[k : k + 1] = [*_chain(loop[k], following), loop[k]]
+            else:
+                k += 1
         loops.append(np.asarray(loop, dtype=np.int32))
     return sorted(loops, key=len, reverse=True)
+
+
+def _chain(start: int, following: dict[int, list[int]]) -> list[int]:
+    """From vertex to vertex until it is closed; edges that it takes are taken out."""
+    chain, at = [start], start
+    while nexts := following.get(at):
+        step = nexts.pop()
+        if not nexts:
+            del following[at]
+        if step == start:
+            break
+        chain.append(step)
+        at = step
+    return chain
 
 
 def connected_components(
@@ -133,7 +141,10 @@ def vertex_faces(
 def hinges(
     faces: Int[np.ndarray, "faces 3"],
 ) -> Int[np.ndarray, "hinges 4"]:
-    """Interior edges with the two vertices opposite to them: (a, b, left, right)."""
+    """Interior edges with the two vertices opposite to them: (a, b, one, other).
+
+    In the order of their faces, not by which lies to the left.
+    """
     f = np.asarray(faces)
     edges = mesh_edges(f)
     inner = np.flatnonzero(edges.count == 2)

@@ -52,7 +52,8 @@ def read_character(
     Args:
         path: The file.
         fps: Frames a second of the result.
-        source_fps: True rate of a file that doesn't say it; else 30. A glTF does.
+        source_fps: True rate of a file that doesn't say it; else 30 (USD: 24, as there). A
+            glTF does.
         mesh: Name of the mesh to take.
         frames: Keep only this many frames.
         motion: What moves a rigged person (glTF, VRM) instead of the file's animation; at

@@ -107,7 +107,7 @@ def _read(
         if node.mesh is None:
             continue
         mesh = file.document.meshes[file.index(node.mesh, file.document.meshes, "mesh")]
-        weights = None if times is None else file.morph_weights(n, times)
+        weights = file.morph_weights(n, times)
         for primitive in mesh.primitives:
             if (primitive.mode if primitive.mode is not None else _TRIANGLES) != _TRIANGLES:
                 continue

@@ -2,6 +2,7 @@
 """Meshes of a USD stage over time: points as time samples, or a skin of UsdSkel."""
 
 import contextlib
+import dataclasses
 import pathlib
 from collections.abc import Iterator
 from typing import Any
@@ -16,8 +17,10 @@ from ._moving import Moving
 from ._texture import texture_beside
 from ._usd_trial import try_stage
 
-# Coordinates and frames that are read at most.
-_MOST, _FRAMES = 3e8, 20_000
+# Coordinates and frames that are read at most, and frames a second between steps.
+_MOST, _FRAMES, _MOST_RATE = 3e8, 20_000, 240.0
+# Time codes a second from which on they are frames.
+_FRAMEWISE = 12.0
 
 
 def read_usd_meshes(
@@ -27,7 +30,8 @@ def read_usd_meshes(
 
     Args:
         path: The stage.
-        fps: Not used: a stage has a rate of its own.
+        fps: Frames a second that are wanted: a stage that counts in longer steps, seconds
+            say, is read between them.
 
     Returns:
         The meshes in metres, their rate, and the axis that is up, if it is said.
@@ -37,7 +41,7 @@ def read_usd_meshes(
         MissingDependencyError: Without usd-core.
     """
     with _damage_told(path):
-        return _read_moving(path)
+        return _read_moving(path, fps)
 
 
 def read_usd_still(path: pathlib.Path) -> list[Moving]:
@@ -50,7 +54,7 @@ def read_usd_still(path: pathlib.Path) -> list[Moving]:
     with _damage_told(path):
         stage = _opened(path)
         code = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
-        return _meshes(path, stage, np.array([code]), bound=True)
+        return list(_meshes(path, stage, np.array([code]), bound=True).values())
 
 
 @contextlib.contextmanager
@@ -85,41 +89,80 @@ def _opened(path: pathlib.Path) -> Any:
     return stage
 
 
-def _read_moving(path: pathlib.Path) -> tuple[list[Moving], float | None, str | None]:
+def _told_times(stage: Any) -> tuple[float, float] | None:
+    """First and last time of a stage: what it says, else of what changes in it; or None."""
+    if stage.HasAuthoredTimeCodeRange():
+        return stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    times = [
+        t
+        for prim in stage.TraverseAll()
+        for told in prim.GetAttributes()
+        if told.ValueMightBeTimeVarying()
+        for t in told.GetTimeSamples()
+    ]
+    return (min(times), max(times)) if times else None
+
+
+def _read_moving(path: pathlib.Path, fps: float) -> tuple[list[Moving], float | None, str | None]:
     from pxr import Usd, UsdGeom, UsdSkel
 
     stage = _opened(path)
-    start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    span = _told_times(stage)
+    start, end = (0.0, 0.0) if span is None else span
     rate = stage.GetTimeCodesPerSecond() or 24.0
     if not (np.isfinite([start, end, rate]).all() and 0 <= end - start < _FRAMES and rate >= 1e-3):
         raise FormatError(
             f"{path}: runs from {start} to {end} at {rate} a second, not a"
             f" clip of up to {_FRAMES:,} frames. Set the range of the clip and export again."
         )
-    if stage.HasAuthoredTimeCodeRange():
+    # A stage that counts in frames is read by them.
+    within = 1 if rate >= _FRAMEWISE else int(np.ceil(min(fps, _MOST_RATE) / rate))
+    codes = start + np.arange(int((end - start) * within + 1e-6) + 1) / within
+    if len(codes) > _FRAMES:
+        raise FormatError(f"{path}: {(end - start) / rate:.0f} s are too long. Cut the clip.")
+    if span is not None:
         # Skinning writes the points of every frame into the stage.
         meshes = [UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
         points = sum(len(m.GetPointsAttr().Get(start) or ()) for m in meshes)
-        if (end - start + 1) * points * 3.0 > _MOST:
-            frames = int(end - start) + 1
-            raise FormatError(f"{path}: {frames} frames of {points:,} points. Cut the clip.")
+        if len(codes) * points * 3.0 > _MOST:
+            raise FormatError(f"{path}: {len(codes)} frames of {points:,} points. Cut the clip.")
+        binds = _bind_poses(path, stage, start)
         UsdSkel.BakeSkinning(Usd.PrimRange(stage.GetPseudoRoot()))
-    parts = _meshes(path, stage, start + np.arange(int(end - start) + 1), bound=False)
+    else:
+        binds = {}
+    parts = [
+        dataclasses.replace(part, bind=binds.get(where))
+        for where, part in _meshes(path, stage, codes, bound=False).items()
+    ]
     moving = [p for p in parts if np.ptp(p.positions, axis=0).max() > 0] or parts
     up = str(UsdGeom.GetStageUpAxis(stage)) if stage.HasAuthoredMetadata("upAxis") else None
-    return moving, float(rate), up
+    return moving, float(rate * within), up
+
+
+def _bind_poses(
+    path: pathlib.Path, stage: Any, code: float
+) -> dict[str, Float[np.ndarray, "vertices 3"]]:
+    """Skins as they were bound, by the path of their mesh."""
+    from pxr import UsdSkel
+
+    return {
+        where: part.positions[0]
+        for where, part in _meshes(path, stage, np.array([code]), bound=True).items()
+        if UsdSkel.BindingAPI(stage.GetPrimAtPath(where)).GetJointIndicesPrimvar().HasValue()
+    }
 
 
 def _meshes(
     path: pathlib.Path, stage: Any, codes: Float[np.ndarray, " frames"], *, bound: bool
-) -> list[Moving]:
-    """Meshes at these times, in the stage's unit [m]; skins where they were bound, if wanted."""
+) -> dict[str, Moving]:
+    """Meshes at these times by their path, in the stage's unit [m]; skins as bound, if wanted."""
     from pxr import Usd, UsdGeom, UsdSkel
 
     # Unsaid it would mean centimetres, which files in metres don't say either.
     said = UsdGeom.StageHasAuthoredMetersPerUnit(stage)
     unit = UsdGeom.GetStageMetersPerUnit(stage) if said else 1.0
-    parts, points = [], 0
+    parts: dict[str, Moving] = {}
+    points = 0
     for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
         if not prim.IsA(UsdGeom.Mesh):
             continue
@@ -163,7 +206,7 @@ def _meshes(
         if drawn is not None and uv is not None and uv_faces is not None:
             uv, uv_faces, drawn = moved_charts(uv, uv_faces, drawn, moves)
         part = Moving(prim.GetName(), x, faces, uv, uv_faces, polygons=drawn)
-        parts.append(part.reversed() if mirrored else part)
+        parts[str(prim.GetPath())] = part.reversed() if mirrored else part
     return parts
 
 

@@ -24,6 +24,10 @@ AMASS_ARRAYS = (
 # A rotation vector longer than this is no pose [rad].
 _MOST_TURN = 1e6
 
+# Whose lowest joint ends so far along one axis, and hardly elsewhere along another, went
+# along the one over a floor across the other [m].
+_TRAVELLED, _LEVEL = 0.3, 0.1
+
 # Joint, its parent, and where it is from there on a person of ordinary build [m].
 _FIGURE: tuple[tuple[str, str | None, tuple[float, float, float]], ...] = (
     ("pelvis", None, (0.0, 0.0, 0.0)),
@@ -69,7 +73,8 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
     Note:
         Shape parameters are ignored, as no SMPL model is at hand to read them. A body
         of that family leans its limbs a few degrees from an exact T-pose at rest; limbs
-        are off by as much. Which axis is up is told by how the person stands on average.
+        are off by as much. Z is up, unless the person stands
+        along Y on average and doesn't go that way over a floor along Z.
 
     References:
         Mahmood et al., AMASS: Archive of Motion Capture as Surface Shapes (2019).
@@ -109,8 +114,7 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
     local = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix()
     world = _chained(local.reshape(len(turns), joints, 3, 3), parents)
     offsets = np.array([xyz for _, _, xyz in _FIGURE])
-    up = world[:, 0, :, 1].mean(axis=0)
-    if up[2] > up[1]:
+    if _z_is_up(world, place, offsets, parents):
         turn = Rotation.from_euler("X", -90, degrees=True).as_matrix()
         world, place = turn @ world, place @ turn.T
     return SourceClip(
@@ -124,6 +128,26 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
         str(path),
         rest=np.tile(np.eye(3), (joints, 1, 1)),
     )
+
+
+def _z_is_up(
+    world: Float[np.ndarray, "frames joints 3 3"],
+    place: Float[np.ndarray, "frames 3"],
+    offsets: Float[np.ndarray, "joints 3"],
+    parents: tuple[int, ...],
+) -> bool:
+    """Whether the person stands along Z on average, or crawls along Y."""
+    up = world[:, 0, :, 1].mean(axis=0)
+    if up[2] > up[1]:
+        return True
+    at = np.zeros((len(world), len(parents), 3))
+    for j, parent in enumerate(parents):
+        if parent >= 0:
+            at[:, j] = at[:, parent] + world[:, parent] @ offsets[j]
+    lowest = (at + place[:, None]).min(axis=1)
+    few = max(1, len(lowest) // 5)
+    gone = np.abs(np.median(lowest[-few:], axis=0) - np.median(lowest[:few], axis=0))
+    return bool(gone[1] > _TRAVELLED and gone[2] < _LEVEL)
 
 
 def _chained(

@@ -1,6 +1,8 @@
 """A glTF file's document: read if it is one, refused if it can't be used."""
 
+import json
 import pathlib
+import struct
 import warnings
 from typing import Any
 
@@ -39,6 +41,9 @@ def parse_gltf(path: pathlib.Path) -> Any:
             warnings.simplefilter("ignore", UserWarning)
             document: Any = (loader.load_binary if binary else loader.load_json)(str(path))
         version = str(document.asset.version)
+        # pygltflib leaves them out.
+        for node, told in zip(document.nodes, _told_nodes(path, binary), strict=True):
+            node.weights = told.get("weights")
     # The library fails in as many ways as a file can be broken.
     except Exception as error:
         raise MotionError.at(
@@ -58,3 +63,15 @@ def parse_gltf(path: pathlib.Path) -> Any:
                 "Unpack it: npx @gltf-transform/cli copy IN OUT",
             )
     return document
+
+
+def _told_nodes(path: pathlib.Path, binary: bool) -> list[dict[str, Any]]:
+    """The nodes as the file has them."""
+    with path.open("rb") as file:
+        if binary:
+            # A header of twelve bytes, then the size and the kind of the first chunk.
+            size, _ = struct.unpack("<2I", file.read(20)[12:])
+            text = file.read(size)
+        else:
+            text = file.read()
+    return json.loads(text.decode("utf-8")).get("nodes") or []

@@ -105,26 +105,51 @@ class GltfFile:
         dtype, width = _DTYPES.get(a.componentType), _WIDTHS.get(a.type)
         if dtype is None or width is None or type(a.count) is not int or a.count < 1:
             raise self.broken(f"accessor {which} of type {a.type}, {a.componentType}, {a.count}")
-        if a.sparse is not None or a.bufferView is None:
-            raise self.broken(f"accessor {which} is sparse, which isn't read")
-        view = document.bufferViews[self.index(a.bufferView, document.bufferViews, "view")]
-        size = np.dtype(dtype).itemsize * width
-        step = view.byteStride or size
-        start = a.byteOffset or 0
-        end = start + step * (a.count - 1) + size
-        if min(start, step - size) < 0 or end > (view.byteLength or 0):
-            raise self.broken(f"accessor {which} reaches past its view")
-        first = (view.byteOffset or 0) + start
-        blob = self._buffer(view.buffer)
-        if first < 0 or first - start + (view.byteLength or 0) > len(blob):
-            raise self.broken(f"view {a.bufferView} reaches past its buffer")
-        rows = np.ndarray(
-            (a.count, width), dtype, buffer=blob, offset=first, strides=(step, size // width)
-        )
+        if a.bufferView is None:
+            if a.sparse is None or a.count * width > _MOST_KEYS:
+                raise self.broken(f"accessor {which} has no values")
+            rows = np.zeros((a.count, width), dtype)
+        else:
+            rows = self._rows(a.bufferView, a.byteOffset, dtype, a.count, width).copy()
+        if a.sparse is not None:
+            self._scatter(which, a.sparse, rows)
         values = rows[:, 0] if width == 1 else rows
         if a.normalized:
             return np.maximum(values / np.iinfo(dtype).max, -1.0)
-        return values.copy()
+        return values
+
+    def _rows(
+        self, which: object, offset: int | None, dtype: str, count: int, width: int
+    ) -> np.ndarray:
+        """Rows of a buffer's view, where they lie."""
+        views = self.document.bufferViews
+        view = views[self.index(which, views, "view")]
+        size = np.dtype(dtype).itemsize * width
+        step = view.byteStride or size
+        start = offset or 0
+        end = start + step * (count - 1) + size
+        if min(start, step - size) < 0 or end > (view.byteLength or 0):
+            raise self.broken(f"an accessor reaches past view {which}")
+        first = (view.byteOffset or 0) + start
+        blob = self._buffer(view.buffer)
+        if first < 0 or first - start + (view.byteLength or 0) > len(blob):
+            raise self.broken(f"view {which} reaches past its buffer")
+        return np.ndarray(
+            (count, width), dtype, buffer=blob, offset=first, strides=(step, size // width)
+        )
+
+    def _scatter(self, which: object, sparse: Any, rows: np.ndarray) -> None:
+        """Puts the rows in that an accessor tells one by one (glTF 2.0, 3.6.2.3)."""
+        index, values = sparse.indices, sparse.values
+        kind = _DTYPES.get(index.componentType)
+        if type(sparse.count) is not int or not 1 <= sparse.count <= len(rows) or kind is None:
+            raise self.broken(f"accessor {which} is sparse in {sparse.count} places")
+        at = self._rows(index.bufferView, index.byteOffset, kind, sparse.count, 1)[:, 0]
+        if at.dtype.kind not in "iu" or int(at.min()) < 0 or int(at.max()) >= len(rows):
+            raise self.broken(f"accessor {which} is sparse in places that it hasn't")
+        rows[at.astype(np.int64)] = self._rows(
+            values.bufferView, values.byteOffset, rows.dtype.str, sparse.count, rows.shape[1]
+        )
 
     def local(self, node: int) -> dict[str, Float[np.ndarray, " n"]]:
         """Translation, rotation (xyzw) and scale of a node."""
@@ -291,14 +316,29 @@ class GltfFile:
         return out
 
     def morph_weights(
-        self, node: int, times: Float[np.ndarray, " frames"], animation: int = 0
+        self, node: int, times: Float[np.ndarray, " frames"] | None, animation: int = 0
     ) -> Float[np.ndarray, "frames targets"] | None:
-        """Weights of a node's morph targets over time; None where nothing moves them."""
-        track = self._tracks(animation).get((node, "weights"))
-        if track is None:
-            return None
+        """Weights of a node's morph targets over time; None where there are none.
+
+        A single frame where nothing moves them: those of the node, else of its mesh.
+        """
+        track = None if times is None else self._tracks(animation).get((node, "weights"))
+        if track is None or times is None:
+            return self._resting_weights(node)
         keys, values, mode = track
         return track_at(keys, values, mode, times, "weights")
+
+    def _resting_weights(self, node: int) -> Float[np.ndarray, "1 targets"] | None:
+        told, meshes = self.document.nodes[node], self.document.meshes
+        weights = told.weights
+        if not weights and told.mesh is not None:
+            weights = meshes[self.index(told.mesh, meshes, "mesh")].weights
+        if not weights:
+            return None
+        out = np.array(weights, float)
+        if out.ndim != 1 or not (np.abs(out) < _FARTHEST).all():
+            raise self.broken(f"the weights of node {node}")
+        return out[None]
 
     def image(self, texture: object) -> tuple[str, bytes | None]:
         """Name and file of a texture's image; no file where it isn't beside this one."""

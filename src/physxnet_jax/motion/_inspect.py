@@ -14,7 +14,7 @@ from ._faults import sudden_turns
 from ._load import fitted_motion, read_motion
 from ._motion import Motion, resample
 from ._procedural import CLIPS
-from ._reference import reference_pose, stands, upright
+from ._reference import ALWAYS, mean_trunk, reference_pose, stands, upright
 from ._retarget import foot_heights, joint_index, leg_length
 from ._skeletons import find_joint_map, read_joint_map
 from ._source import SourceClip
@@ -125,6 +125,11 @@ def inspect_motion(
     found, course = _skeleton(read, told, body, rest), _course(body, clip, rest)
     left_out = tuple(n for n in body.joint_names if n not in found.carried and n.endswith(_FELT))
     notes = list(course.notes)
+    if found.lies:
+        notes.append(
+            "its trunk points along Z all the time: if nobody lies there, its frames were written"
+            " with Z up and its rest pose with Y up; export it anew."
+        )
     if left_out:
         notes.append(f"{', '.join(left_out)} follow their parents: the skeleton has no such joint.")
     if found.added:
@@ -168,6 +173,7 @@ class _Skeleton(NamedTuple):
     added: tuple[str, ...]
     reference: str
     unit: str | None
+    lies: bool = False
 
 
 def _skeleton(
@@ -187,6 +193,7 @@ def _skeleton(
         () if told is None else tuple(sorted(index.keys() - told.keys())),
         _reference(read, index),
         _unit(read, index, body, rest),
+        bool(mean_trunk(upright(read, index), index)[2] > ALWAYS),
     )
 
 
@@ -208,9 +215,11 @@ def _course(body: Body, clip: Motion, rest: Float[Array, "all 3"]) -> _Course:
     heights = foot_heights(body, steady, rest)
     feet, low = float(np.median(heights)), float(heights.min())
     problems, notes = [], []
-    turns = sudden_turns(body, clip)
+    # As it is dressed: what turns fast enough between four frames needn't between two of them.
+    turns = sudden_turns(body, steady)
     if turns is not None:
-        problems.append(turns.partition(": ")[2])
+        rate = "" if steady is clip else f" (frames of {_RATE:g} a second)"
+        problems.append(turns.partition(": ")[2].removesuffix(".") + f"{rate}.")
     if fastest > _FASTEST:
         frame = int(speeds.argmax() * clip.fps / steady.fps)
         problems.append(

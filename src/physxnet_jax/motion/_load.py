@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..body import Body
+from ..body import Body, load_body
 from ..errors import MotionError
 from ..files import is_file, read_arrays, whole_file
 from ._amass import AMASS_ARRAYS, amass_clip
@@ -18,7 +18,7 @@ from ._gltf import read_gltf
 from ._gltf_file import GLTF_FORMATS
 from ._motion import Motion, make_motion, resample
 from ._procedural import CLIPS, procedural_clip
-from ._retarget import retarget
+from ._retarget import retarget, stand_on_floor
 from ._skeletons import read_joint_map
 from ._source import SourceClip, is_real
 
@@ -46,7 +46,8 @@ def load_motion(
         joint_map: Body joint to the file's joint, for a skeleton of unknown names, or
             a file of them (`read_joint_map`).
         body: Body to retarget to; the built-in one by default.
-        shape: Its shape parameters, whose proportions set how it stands and steps.
+        shape: Its shape parameters, whose proportions set how it stands and steps; what
+            `save_motion` wrote is stood on the floor, its steps stay as they are.
 
     Returns:
         The motion on the body's skeleton.
@@ -79,7 +80,10 @@ def fitted_motion(
                 f"joint_map is for skeletons of other names; '{read.name}' has the body's. Leave"
                 " it out."
             )
-        return read
+        if shape is None:
+            return read
+        body = load_body() if body is None else body
+        return stand_on_floor(body, read, body.rest_vertices(shape))
     if isinstance(joint_map, str | pathlib.Path):
         joint_map = read_joint_map(joint_map)
     return retarget(read, body, joint_map=joint_map, shape=shape)

@@ -1,5 +1,6 @@
 """A pose in which it is known where a skeleton's limbs point."""
 
+import dataclasses
 from collections.abc import Mapping
 
 import numpy as np
@@ -16,15 +17,32 @@ _BOTH = ("Left", "Right")
 SHORTEST, LONGEST = 1e-9, 1e9
 # At rest a skeleton stands if its legs and trunk lean less than 45 degrees.
 _STANDING = float(np.cos(np.radians(45.0)))
+# Who points this far one way on average stands or lies like that all the time.
+ALWAYS = 0.8
 # DAZ figures hold their forearms 17 degrees forward in their T-pose.
 _T_POSE = float(np.cos(np.radians(25.0)))
 
 
 def upright(source: SourceClip, index: Mapping[str, int]) -> SourceClip:
-    """The clip with Y up, if its skeleton stands along Z at rest."""
+    """The clip with Y up, if its skeleton stands along Z at rest.
+
+    If its motion stands along Y by itself the rest pose alone is turned.
+    """
     if stands(source, index, 2) and not stands(source, index, 1):
-        return source.turned(Rotation.from_euler("X", -90, degrees=True).as_matrix())
+        turn = Rotation.from_euler("X", -90, degrees=True).as_matrix()
+        turned = source.turned(turn)
+        if mean_trunk(source, index)[1] > ALWAYS:
+            return dataclasses.replace(source, rest=turned.rest)
+        return turned
     return source
+
+
+def mean_trunk(source: SourceClip, index: Mapping[str, int]) -> Float[np.ndarray, "3"]:
+    """Which way the trunk points on average, from hips to shoulders; 1 long if always so."""
+    p = source.positions()
+    hips, arms = (p[:, index[f"Left{n}"]] + p[:, index[f"Right{n}"]] for n in ("UpLeg", "Arm"))
+    trunk = arms - hips
+    return np.mean(trunk / np.maximum(np.linalg.norm(trunk, axis=1, keepdims=True), 1e-9), axis=0)
 
 
 def stands(source: SourceClip, index: Mapping[str, int], axis: int) -> bool:

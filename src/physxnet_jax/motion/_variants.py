@@ -21,7 +21,7 @@ def mirror_joints(body: Body) -> Int[np.ndarray, " joints"]:
         MotionError: A joint of one side without its counterpart.
     """
     names = list(body.joint_names)
-    swapped = [re.sub(r"^(Left|Right|L(?=Hip)|R(?=Hip))", _other, n) for n in names]
+    swapped = [re.sub(r"^(Left|Right|[LR](?=Hip|Thumb))", _other, n) for n in names]
     missing = [s for s in swapped if s not in names]
     if missing:
         raise MotionError(
