@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import platform
 import types
 
 import jax
@@ -18,6 +19,7 @@ from physxnet_jax.cli._bench_net import (
     _place,
     _to_json,
     _with_errors,
+    _with_evaluated,
     engines,
     floors,
     markdown,
@@ -218,8 +220,13 @@ def test_rows_of_another_machine_or_of_other_weights_are_not_gone_on_with(tmp_pa
         out.write_text(json.dumps({"machine": where, "rows": rows}))
         assert main([*words, str(out)]) == 2
         assert says in " ".join(capsys.readouterr().err.split())
-    # Nothing was noted in former versions: nothing is compared.
-    for there in ({"machine": machine(), "rows": rows}, {"rows": rows}):
+    # What wasn't noted in former versions isn't compared.
+    vague = machine() | {"cpu": platform.machine()}
+    for there in (
+        {"machine": machine(), "rows": rows},
+        {"machine": vague, "rows": rows},
+        {"rows": rows},
+    ):
         out.write_text(json.dumps(there))
         assert [r.weights for r in kept_rows(out, _from_json)] == [16 * "0"]
 
@@ -299,6 +306,35 @@ def test_every_kind_of_device_is_measured_once():
     assert _first_of_each([card, second, cpu]) == [card, cpu]
     assert _first_of_each([cpu, cpu]) == [cpu]
     assert jax.devices("cpu")[0] in present_devices()
+
+
+def test_rows_take_the_errors_that_were_evaluated_since(tmp_path):
+    nan = float("nan")
+
+    def row(method, size, garments, **more):
+        common = ("cpu", 1, garments, 1.0, 1.0, 0.5, 1.0, 9, nan, 0.1, nan)
+        return Cost(method, size, *common, **more)
+
+    found = {
+        name: dict(zip(TEMPLATES, values, strict=True))
+        for name, values in {
+            "lbs": (3.0, 4.0, 5.0),
+            "small+push": (6.0, 7.0, 8.0),
+            "draft": (1.0, 2.0, 6.0),
+        }.items()
+    }
+    assert _with_evaluated(row("lbs", "-", 3), found).rmse_mm == 4.0
+    assert _with_evaluated(row("network+push", "small", 2), found).rmse_each == {
+        "top": 6,
+        "bottom": 7,
+    }
+    assert _with_evaluated(row("simulator", "draft", 3), found).rmse_mm == 3.0
+    # What wasn't evaluated stays as it was measured.
+    for other in (
+        row("network", "small", 1),
+        row("network+push", "small", 1, precision="bfloat16"),
+    ):
+        assert _with_evaluated(other, found) == other
 
 
 def test_a_row_timed_again_has_the_errors_of_its_garments():

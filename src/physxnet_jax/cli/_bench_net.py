@@ -33,9 +33,8 @@ from ..motion import load_motion
 from ..simulation import ACCURACY
 from ..viewer import draw_work_precision
 from ._experiment_commands import Bench
-from ._machine import machine
 from ._progress import progress_bars
-from ._rows import check_rows_file, kept_rows, weights_digest
+from ._rows import check_rows_file, kept_rows, measured_on, weights_digest
 
 
 def bench_net(command: Bench, console: Console) -> int:
@@ -62,6 +61,8 @@ def bench_net(command: Bench, console: Console) -> int:
                 f"{command.out}: {r.size} was measured with other weights of that name. Name"
                 " another --out, or delete that file."
             )
+    rows = [_with_evaluated(r, known_errors) for r in rows]
+    noted = measured_on(command.out)
     plain: Precision = "float32"
     jobs: list[tuple[str, str, Precision]] = [("lbs", "-", plain)]
     jobs.extend(("engine" if s in ENGINES else "simulator", s, plain) for s in command.simulator)
@@ -92,7 +93,7 @@ def bench_net(command: Bench, console: Console) -> int:
             rows.sort(key=_place)
             if command.out is not None:
                 data = [_to_json(r) for r in rows]
-                write_json(command.out, {"machine": machine(), "rows": data})
+                write_json(command.out, {"machine": noted, "rows": data})
         progress("methods", len(work), len(work))
     text = markdown(rows)
     console.print(text, markup=False, highlight=False, soft_wrap=True)
@@ -135,6 +136,19 @@ def _missing(command: Bench, known: Sequence[Cost]) -> Iterator[Bench]:
             lacking.setdefault(batches, []).append(g)
     for batches, garments in lacking.items():
         yield dataclasses.replace(command, garments=tuple(garments), batches=batches)
+
+
+def _with_evaluated(row: Cost, evaluated: Mapping[str, dict[Template, float]]) -> Cost:
+    """A row with the errors that `physxnet evaluate` gives its method now."""
+    name = {"lbs": "lbs", "network+push": f"{row.size}+push"}.get(row.method, row.size)
+    found = evaluated.get(name, {})
+    worn = TEMPLATES[: row.garments]
+    if row.precision != "float32" or not set(worn) <= found.keys():
+        return row
+    each = {t: round(found[t], 3) for t in worn}
+    return dataclasses.replace(
+        row, rmse_mm=statistics.fmean(found[t] for t in worn), rmse_each=each
+    )
 
 
 def _with_errors(row: Cost, known: Sequence[Cost]) -> Cost:

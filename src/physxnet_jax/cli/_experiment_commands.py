@@ -50,7 +50,8 @@ class Bench:
     data: pathlib.Path | None = None
     """net: a dataset whose test actions give the errors; times alone without one."""
     errors: pathlib.Path | None = None
-    """net: rows of `physxnet evaluate` against that dataset; what is there isn't measured again."""
+    """net: rows of `physxnet evaluate` against that dataset; what is there isn't measured again,
+    and rows of --out take their errors from it."""
     simulator: tuple[Literal["draft", "standard", "fine", "noise", "blender", "newton"], ...] = ()
     """net: accuracies of the simulator to run as well; noise is standard with jitter.
     blender, newton: their times alone, for they model another cloth."""

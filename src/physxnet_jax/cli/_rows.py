@@ -10,7 +10,7 @@ from ..errors import FormatError, WeightsError
 from ..evaluation import DIGITS
 from ..files import check_writable
 from ..io import read_card
-from ._machine import machine
+from ._machine import machine, same_machine
 
 Row = TypeVar("Row")
 
@@ -45,12 +45,19 @@ def kept_rows(path: pathlib.Path | None, made: Callable[[dict[str, Any]], Row]) 
             f"{path}: not rows that this command can go on from ({type(error).__name__}). Name"
             " another file, or delete this one."
         ) from None
-    if there not in (None, machine()):
+    if there is not None and not same_machine(there):
         raise FormatError(
             f"{path}: times of another machine ({there}) don't compare with this one's"
             f" ({machine()}). Name another file, or delete this one."
         )
     return rows
+
+
+def measured_on(path: pathlib.Path | None) -> dict[str, Any]:
+    """The machine of the rows that are there; this one where there are none."""
+    if path is None or not path.is_file():
+        return machine()
+    return json.loads(path.read_text(encoding="utf-8")).get("machine") or machine()
 
 
 def weights_digest(name: str) -> str:
