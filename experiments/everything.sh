@@ -5,7 +5,6 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 physxnet dataset build experiments/configs/dataset_physxnet.py --out runs/ours
-physxnet dataset build experiments/configs/dataset_mirror.py --out runs/mirror
 physxnet dataset build experiments/configs/dataset_extra.py --out runs/extra
 physxnet dataset build experiments/configs/dataset_mixed.py --out runs/mixed
 physxnet dataset build experiments/configs/dataset_mixed_extra.py --out runs/mixed_extra

@@ -80,7 +80,6 @@ EACH_ACTION = (
 NETWORKS = ("local-22", "nano", "small", "local", "local-muon", "pair", "paper")
 SETS = {
     "ours": "protocol",
-    "mirror": "mirrored training actions",
     "extra": "extra actions",
     "left_out": "what the protocol leaves out of the clips of these",
     "mixed": "legs of training actions with upper bodies of others, wider",

@@ -284,6 +284,35 @@ def test_what_is_left_of_a_clip_begins_after_the_longest_action(tmp_path):
     )
     found = left_out(tmp_path, read_protocol(tmp_path))
     assert [(a.name, a.start) for a in found] == [("long", 10.0)]
+    # Asked for by itself the other one gets no stretch that isn't its.
+    config = DatasetConfig(splits=("train",), templates=("bottom",), left_out=True)
+    with pytest.raises(FormatError, match="leaves nothing out of short"):
+        build_dataset(config, tmp_path / "set", tmp_path, only=("short",))
+    assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says"),
+    [
+        ({"splits": ("training",)}, "there are train, test, extra"),
+        ({"splits": ()}, "splits are"),
+        ({"templates": ()}, "there are top, bottom, dress"),
+        ({"speed": 0.0}, "speed is 0.0"),
+        ({"speed": -1.0}, "speed is -1.0"),
+        ({"exaggerate": float("nan")}, "exaggerate is nan"),
+    ],
+)
+def test_settings_that_no_dataset_can_have_are_refused(wrong, says):
+    with pytest.raises(ValueError, match=says):
+        DatasetConfig(**wrong)
+
+
+def test_a_body_of_its_own_upper_half_is_refused(data_dir, tmp_path):
+    for number in (12, 24):
+        config = DatasetConfig(splits=("test",), upper_from=number)
+        with pytest.raises(FormatError, match="is the action itself"):
+            build_dataset(config, tmp_path / "set", data_dir / "mocap")
+    assert not (tmp_path / "set").exists()
 
 
 @pytest.mark.parametrize(

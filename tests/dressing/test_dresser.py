@@ -200,6 +200,18 @@ def test_a_clip_of_no_frames_is_refused(dresser, motion):
     q, p = motion
     with pytest.raises(ValueError, match="no frames"):
         clothe(dresser, q[:0], p[:0], fps=30.0)
+    with pytest.raises(ValueError, match="no pose"):
+        start_clothing(dresser, q[:0], p[:0])
+
+
+def test_two_poses_say_how_a_clip_begins(dresser, whole, motion):
+    """A clip of two frames is the first two of a longer one, live as well."""
+    q, p = motion
+    two = jax.jit(clothe, static_argnames="fps")(dresser, q[:2], p[:2], fps=30.0)
+    np.testing.assert_allclose(two["bottom"], np.asarray(whole["bottom"])[:2], atol=1e-5)
+    stream = start_clothing(dresser, q[:2], p[:2])
+    cloth = clothe_frame(dresser, stream, q[0], p[0], fps=30.0)[1]
+    np.testing.assert_allclose(cloth["bottom"], np.asarray(whole["bottom"])[0], atol=1e-5)
 
 
 def test_poses_of_another_skeleton_are_refused_also_under_jit(dresser, motion):

@@ -1,6 +1,7 @@
 """Mirrored and sped-up motions are what a mirror and a clock would show."""
 
 import dataclasses
+import itertools
 
 import jax.numpy as jnp
 import numpy as np
@@ -137,19 +138,19 @@ def test_what_was_before_a_clip_goes_on_into_it():
     clip = load_motion("walk", fps=60.0)
     q, p = poses_before(clip.rotations, clip.root, 5)
     assert q.shape == (5, 31, 4) and p.shape == (5, 3)
-    np.testing.assert_allclose(
-        p[::-1] + clip.root[1:6], 2 * np.tile(clip.root[0], (5, 1)), atol=1e-6
-    )
-    # About the first pose every joint turned as far before as it does after.
+    # At one speed from the oldest of them to the clip's second pose.
+    way = np.concatenate([p, clip.root[:2]])
+    np.testing.assert_allclose(np.diff(way, n=2, axis=0), 0.0, atol=1e-6)
+    assert np.abs(np.diff(way, axis=0)).max() > 0.01
     turns = [
-        Rotation.from_quat(np.asarray(x), scalar_first=True)
-        for x in (q[-1], clip.rotations[0], clip.rotations[1])
+        Rotation.from_quat(np.asarray(x), scalar_first=True) for x in (*q, *clip.rotations[:2])
     ]
-    np.testing.assert_allclose(
-        (turns[0].inv() * turns[1]).as_matrix(), (turns[1].inv() * turns[2]).as_matrix(), atol=1e-5
-    )
+    steps = [(a.inv() * b).as_matrix() for a, b in itertools.pairwise(turns)]
+    np.testing.assert_allclose(steps, [steps[-1]] * 6, atol=1e-5)
+    assert np.abs(steps[-1] - np.eye(3)).max() > 0.01
     one = poses_before(clip.rotations[:1], clip.root[:1], 3)
     np.testing.assert_allclose(one[1], np.tile(clip.root[:1], (3, 1)), atol=1e-6)
     assert np.abs(np.abs(np.sum(np.asarray(one[0] * clip.rotations[:1]), axis=-1)) - 1).max() < 1e-5
-    spoiled = poses_before(clip.rotations.at[2].set(np.nan), clip.root, 5)
+    assert poses_before(clip.rotations, clip.root, 0)[0].shape == (0, 31, 4)
+    spoiled = poses_before(clip.rotations.at[1].set(np.nan), clip.root, 5)
     assert np.isfinite(np.asarray(spoiled[0])).all() and np.isfinite(np.asarray(spoiled[1])).all()

@@ -495,6 +495,14 @@ def test_the_loss_is_the_sum_that_the_weight_says_and_errors_are_millimetres(tmp
     assert 0.3 * wanted < told["l1_mm_bottom"] < 5.0 * wanted
 
 
+def test_what_came_off_is_no_error_of_nothing(tmp_path):
+    """On what is held out, as on what is learned from."""
+    data = [sequence(seed=0), dataclasses.replace(sequence(seed=1, ok=False), name="b")]
+    config = dataclasses.replace(CONFIG, validation=("b",))
+    with pytest.raises(FormatError, match="no usable cloth in b"):
+        train(config, data, tmp_path, steps=1)
+
+
 def test_another_seed_sees_frames_in_another_order():
     a, b = (np.concatenate([batch_indices(40, 8, s, k) for k in range(5)]) for s in (0, 1))
     assert sorted(a) == sorted(b) and not np.array_equal(a, b)

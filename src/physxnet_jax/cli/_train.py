@@ -1,5 +1,6 @@
 """`physxnet train`: a network from a configuration and datasets."""
 
+import math
 import pathlib
 
 from rich.console import Console
@@ -35,6 +36,8 @@ def train(command: Train, console: Console) -> int:
 
         predictor = run(config, sequences, command.out, steps=command.steps, report=report)
     log = read_metrics(command.out)
+    taught = [s for s in sequences if s.name not in config.validation]
+    measured = [x for x in log if math.isfinite(x.get("validation_mm", math.nan))]
     alarms = sum(line.get("gan_alarm", 0.0) for line in log)
     notes = [read_note(root) for root in command.data]
     card = {
@@ -43,9 +46,17 @@ def train(command: Train, console: Console) -> int:
             {k: n[k] for k in _NAMED if k in n} | {"splits": list(command.splits)} for n in notes
         ],
         "training": {
-            "actions": len(sequences),
-            "frames": sum(s.motion.num_frames for s in sequences),
+            "actions": len(taught),
+            "frames": sum(s.motion.num_frames for s in taught),
             "steps": int(log[-1]["step"]) if log else 0,
+            **(
+                {
+                    "validation": list(config.validation),
+                    "best_step": int(min(measured, key=lambda x: x["validation_mm"])["step"]),
+                }
+                if config.validation and measured
+                else {}
+            ),
             "mirrored too": config.mirror,
             "adversarial": config.adversarial,
             "seed": config.seed,

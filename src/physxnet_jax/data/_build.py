@@ -81,9 +81,19 @@ def build_dataset(
             f"no action '{', '.join(sorted(unknown))}' in the splits {', '.join(config.splits)};"
             f" there are: {', '.join(a.name for a in actions)}."
         )
-    actions = [a for a in actions if not only or a.name in only]
     if config.left_out:
+        # Of all of them: a stretch between two actions belongs to one.
         actions = left_out(folder, actions)
+        if without := set(only) - {a.name for a in actions}:
+            raise FormatError(f"the protocol leaves nothing out of {', '.join(sorted(without))}.")
+    for split in config.splits if config.upper_from else ():
+        number = sum(a.split == split for a in actions)
+        if number and config.upper_from % number == 0:
+            raise FormatError(
+                f"upper_from is {config.upper_from}: {number} actions further on of the split"
+                f" '{split}' is the action itself."
+            )
+    actions = [a for a in actions if not only or a.name in only]
     open_dataset(root, _note(config))
     mine = actions[shard[0] :: shard[1]]
     jobs: list[tuple[Template, Action]] = [(t, a) for t in config.templates for a in mine]

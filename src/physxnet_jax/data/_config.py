@@ -3,9 +3,13 @@
 import dataclasses
 from typing import Any, Literal
 
+from ..errors import check_numbers
 from ..garment import TEMPLATES, Template
 from ..simulation import XPBD
 from ..simulation.blender import BlenderSettings
+
+SPLITS = ("train", "test", "extra")
+"""Parts of the protocol."""
 
 CARD: dict[str, Any] = {
     "licence": "The motion is the CMU Graphics Lab Motion Capture Database's, free for all uses"
@@ -49,6 +53,13 @@ class DatasetConfig:
     networks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        check_numbers(self, "speed", "exaggerate")
+        for name, told, known in (
+            ("splits", self.splits, SPLITS),
+            ("templates", self.templates, TEMPLATES),
+        ):
+            if not told or set(told) - set(known):
+                raise ValueError(f"{name} are {told}; there are {', '.join(known)}.")
         if (self.engine == "network") != bool(self.networks):
             raise ValueError(f"engine {self.engine} with networks {self.networks}: name both.")
 

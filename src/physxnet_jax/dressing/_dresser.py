@@ -264,19 +264,21 @@ def start_clothing(
     Args:
         dresser: From `make_dresser`.
         rotations: Joint rotations of the first frame, of a person who stood still until
-            now; or of the first frames, where they are known: the person then moved as
-            they begin, as in `clothe`. As many as a network sees before one are enough.
+            now; or of the first frames, where they are known, of which two are enough:
+            the person then moved as they begin, as in `clothe`.
         root: Position of the root joint [m], likewise.
 
     Returns:
         The stream before the first frame.
 
     Raises:
-        ValueError: Of another skeleton than the body's.
+        ValueError: Of another skeleton than the body's, or no pose.
     """
     if rotations.ndim == 2:
         rotations, root = rotations[None], root[None]
     _check_pose(dresser.body, rotations, root, ("frames",))
+    if not rotations.shape[0]:
+        raise ValueError("no pose: give the first one, or the first two.")
     before = poses_before(rotations, root, dresser.predictor.config.inputs.window - 1)
     world, shift = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*before)
     return start_stream(dresser.predictor, world, shift)

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import Body
-from ..geometry import quaternion_conjugate, quaternion_multiply
+from ..geometry import quaternion_conjugate, quaternion_multiply, safe_normalize
 from ._motion import Motion, check_joints
 
 BLOCK = 16
@@ -41,28 +41,35 @@ def poses_before(
 ) -> tuple[Float[Array, "before joints 4"], Float[Array, "before 3"]]:
     """What a person did before a clip began, if it went on as it begins; pure.
 
-    The clip's start, mirrored in time about its first pose: velocities go on and no
+    Every joint turns, and the root goes, as fast as between the clip's first two poses: no
     acceleration is made up, where a person who stood still until then would be thrown into
     motion within a frame, the harder the more frames a second there are.
 
     Args:
         rotations: Joint rotations of the clip, wxyz.
         root: Positions of the root joint [m].
-        count: Poses wanted; those of a shorter clip end with its last.
+        count: Poses wanted; who has a single pose stood still in it.
 
     Returns:
         Rotations and root positions, oldest first.
     """
+    rotations, root = jnp.asarray(rotations), jnp.asarray(root)
+    if count == 0:
+        return rotations[:0], root[:0]
     # In JAX's numbers: an exported clip's length is none of NumPy's.
-    after = jnp.minimum(jnp.arange(count, 0, -1), rotations.shape[0] - 1)
-    q, p = rotations[after], root[after]
+    second = jnp.minimum(1, rotations.shape[0] - 1)
+    q, p = rotations[second], root[second]
     # A pose that isn't finite spoils no frame before it.
-    known = jnp.isfinite(q).all(axis=(1, 2)) & jnp.isfinite(p).all(axis=1)
-    q = jnp.where(known[:, None, None], q, rotations[:1])
-    p = jnp.where(known[:, None], p, root[:1])
-    first = jnp.broadcast_to(rotations[:1], q.shape)
-    back = quaternion_multiply(quaternion_multiply(first, quaternion_conjugate(q)), first)
-    return back, 2.0 * root[:1] - p
+    known = jnp.isfinite(q).all() & jnp.isfinite(p).all()
+    q, p = jnp.where(known, q, rotations[0]), jnp.where(known, p, root[0])
+    step = safe_normalize(quaternion_multiply(rotations[0], quaternion_conjugate(q)))
+    turns, places = [], []
+    last, at = rotations[0], root[0]
+    for _ in range(count):
+        last, at = quaternion_multiply(step, last), at + (root[0] - p)
+        turns.append(last)
+        places.append(at)
+    return jnp.stack(turns[::-1]), jnp.stack(places[::-1])
 
 
 def before_transforms(

@@ -80,6 +80,7 @@ def train(
 
     Raises:
         PhysXNetError: Too many updates in a row that aren't finite.
+        FormatError: Nothing usable to learn from or to validate on.
     """
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -93,6 +94,10 @@ def train(
     images = (mirrored_sequence(body, s) for s in used if config.mirror)
     frames = load_frames(itertools.chain(used, images), garments, body, rest, config.model.inputs)
     unseen = load_frames(held, garments, body, rest, config.model.inputs) if held else None
+    if unseen is not None and not any(x.any() for x in unseen.usable.values()):
+        raise FormatError(
+            f"no usable cloth in {', '.join(config.validation)}: validate on another action."
+        )
     normalisation = _normalisation(config, frames, surface, tables)
     per_epoch = max(len(frames) // config.batch, 1)
     total = per_epoch * config.epochs
@@ -190,7 +195,8 @@ def _validate(
             weights[t] += count
         if start <= len(order) // 2 < start + config.batch:
             shown = {t: (np.asarray(a[0]), np.asarray(b[0])) for t, (a, b) in maps.items()}
-    each = {f"validation_mm_{t}": sums[t] / max(weights[t], 1.0) for t in sums}
+    # What of it came off the body tells nothing.
+    each = {f"validation_mm_{t}": sums[t] / weights[t] for t in sums if weights[t]}
     return {"validation_mm": float(np.mean(list(each.values()))), **each}, shown
 
 
