@@ -35,5 +35,5 @@ python experiments/mirrored_answer.py
 python experiments/cloth_memory.py
 python experiments/clip_start.py
 python experiments/unseen.py
-python experiments/reproduce.py --data runs/blender --methods lbs local local+push pair+mirror paper paper+push standard
+python experiments/reproduce.py --data runs/blender --methods lbs nearest mlp nano small local local+push pair+mirror paper paper+push draft standard
 python experiments/reproduce.py --data runs/ours

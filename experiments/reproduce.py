@@ -1,8 +1,8 @@
 """The paper's experiment: every number and figure of docs/reproduction.md.
 
 Command: python experiments/reproduce.py --data runs/ours
-         --data runs/blender --methods lbs local local+push pair+mirror paper paper+push
-         standard (if it is built)
+         --data runs/blender --methods lbs nearest mlp nano small local local+push pair+mirror
+         paper paper+push draft standard (if it is built; nearest and mlp learn from runs/ours)
 Cost:    about 40 minutes on two cores for all methods (penetration and the simulator take most
          of it); goes on where it was stopped.
 Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png;
