@@ -77,6 +77,12 @@ EACH_ACTION = (
     *("lbs", "nearest", "mlp", "local-22", "nano", "small", "local", "local+relax+push"),
     *("pair+mirror", "pair+mirror+relax+push", "paper", "paper+push", "draft", "standard", "noise"),
 )
+# Whose errors are told over those of skinning.
+SHARES = (
+    *("local", "local-muon", "local+mirror", "pair", "pair+mirror", "pair+mirror+push"),
+    *("pair+mirror+relax+push", "noise"),
+)
+OURS = "physxnet"
 NETWORKS = ("local-22", "nano", "small", "local", "local-muon", "pair", "paper")
 SETS = {
     "ours": "protocol",
@@ -121,6 +127,7 @@ def main() -> None:
     blocks["paper_longer"] = summary_table(longer)
     blocks["sizes"] = sizes_table()
     blocks["bounds"] = bounds_table(rows)
+    blocks["shares"] = shares_table(rows)
     for name in (
         "ablations",
         "unseen",
@@ -293,6 +300,31 @@ def note_measured(name: str, rows: list[ActionError]) -> None:
     ]
     with whole_file(path) as part:
         part.write_text(json.dumps(card, indent=1))
+
+
+def shares_table(rows: list[ActionError]) -> str:
+    """Errors over skinning's: all cells, and those in which the simulation agrees with itself.
+
+    The latter: its runs from starts 1e-6 m apart (`noise`) differ by less than half of what
+    skinning is off.
+    """
+    of = {(r.method, r.template, r.action): r.rmse_vertices_mm for r in rows if r.engine == OURS}
+    every = [(t, a) for t in TEMPLATES for a in sorted({a for _, _, a in of})]
+    agreed = [c for c in every if of["noise", *c] < 0.5 * of["lbs", *c]]
+    few = f"top, {len(agreed)} of {len(every)} cells"
+    lines = [
+        f"| method | {' | '.join(TEMPLATES)} | {few} | bottom | dress |",
+        "|---" * 7 + "|",
+    ]
+    for method in SHARES:
+        cells = []
+        for chosen in (every, agreed):
+            for t in TEMPLATES:
+                mine = [c for c in chosen if c[0] == t]
+                ours, plain = (sum(of[m, *c] for c in mine) for m in (method, "lbs"))
+                cells.append(f"{ours / plain:.3f}")
+        lines.append(f"| {method} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
 
 
 def more_motion(rows: list[ActionError]) -> str:

@@ -204,6 +204,7 @@ def test_the_reproduction_shows_what_was_measured():
     few = [r for r in rows if r.method in made["EACH_ACTION"]]
     assert len(few) < len(rows) and error_tables(few).strip() in text
     assert made["claims"](rows) in text and made["dataset_table"]() in text
+    assert made["shares_table"](rows) in text
     assert made["sizes_table"]() in text and made["bounds_table"](rows) in text
     for name, table in (("more_motion", made["more_motion"]), ("paper_longer", summary_table)):
         more = json.loads((ROOT / f"experiments/results/{name}.json").read_text())
