@@ -1,5 +1,6 @@
 """Motion in the layout of AMASS: poses of the SMPL family, without any of its models."""
 
+import dataclasses
 import pathlib
 from collections.abc import Mapping
 
@@ -114,10 +115,7 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
     local = Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix()
     world = _chained(local.reshape(len(turns), joints, 3, 3), parents)
     offsets = np.array([xyz for _, _, xyz in _FIGURE])
-    if _z_is_up(world, place, offsets, parents):
-        turn = Rotation.from_euler("X", -90, degrees=True).as_matrix()
-        world, place = turn @ world, place @ turn.T
-    return SourceClip(
+    clip = SourceClip(
         names,
         parents,
         offsets,
@@ -128,23 +126,19 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
         str(path),
         rest=np.tile(np.eye(3), (joints, 1, 1)),
     )
+    if not _z_is_up(clip):
+        return clip
+    # The figure at rest has Y up already.
+    turn = Rotation.from_euler("X", -90, degrees=True).as_matrix()
+    return dataclasses.replace(clip, rotations=turn @ world, root=place @ turn.T)
 
 
-def _z_is_up(
-    world: Float[np.ndarray, "frames joints 3 3"],
-    place: Float[np.ndarray, "frames 3"],
-    offsets: Float[np.ndarray, "joints 3"],
-    parents: tuple[int, ...],
-) -> bool:
+def _z_is_up(clip: SourceClip) -> bool:
     """Whether the person stands along Z on average, or crawls along Y."""
-    up = world[:, 0, :, 1].mean(axis=0)
+    up = clip.rotations[:, 0, :, 1].mean(axis=0)
     if up[2] > up[1]:
         return True
-    at = np.zeros((len(world), len(parents), 3))
-    for j, parent in enumerate(parents):
-        if parent >= 0:
-            at[:, j] = at[:, parent] + world[:, parent] @ offsets[j]
-    lowest = (at + place[:, None]).min(axis=1)
+    lowest = clip.positions().min(axis=1)
     few = max(1, len(lowest) // 5)
     gone = np.abs(np.median(lowest[-few:], axis=0) - np.median(lowest[:few], axis=0))
     return bool(gone[1] > _TRAVELLED and gone[2] < _LEVEL)

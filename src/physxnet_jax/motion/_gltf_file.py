@@ -19,6 +19,8 @@ from ._source import nominal_rate
 
 _MAX_NODES = 20_000
 _MOST_KEYS = 100_000_000
+# Numbers of which a file holds none, for they are zero.
+_MOST_SPARSE = 10_000_000
 # Frames times nodes: each is a matrix.
 _MOST_NODE_FRAMES = 1.2e7
 _DTYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -106,7 +108,7 @@ class GltfFile:
         if dtype is None or width is None or type(a.count) is not int or a.count < 1:
             raise self.broken(f"accessor {which} of type {a.type}, {a.componentType}, {a.count}")
         if a.bufferView is None:
-            if a.sparse is None or a.count * width > _MOST_KEYS:
+            if a.sparse is None or a.count * width > _MOST_SPARSE:
                 raise self.broken(f"accessor {which} has no values")
             rows = np.zeros((a.count, width), dtype)
         else:
