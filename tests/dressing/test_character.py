@@ -24,7 +24,7 @@ from physxnet_jax.dressing._character import (
 )
 from physxnet_jax.dressing._dress import unbound_wearable
 from physxnet_jax.dressing._layers import layer_height
-from physxnet_jax.dressing._push_out import make_patch
+from physxnet_jax.dressing._push_out import faces_at_rest, make_patch
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import template
 from physxnet_jax.geometry import closest_points, make_mesh, vertex_normals
@@ -172,7 +172,7 @@ def test_skin_is_looked_for_where_cloth_slid_but_not_on_another_limb(character):
     g = on_character(template("bottom"), character)
     w = unbound_wearable(body, rest, g)
     patch = make_patch(body, rest, w, g.mesh)
-    still, skin, usual = (np.asarray(x) for x in (w.rest, patch.rest, patch.candidates))
+    still, skin, usual = (np.asarray(x) for x in (w.rest, patch.rest, faces_at_rest(patch)))
     middle = skin[np.asarray(patch.faces)].mean(axis=1)
 
     def reach(points, rows):
@@ -183,7 +183,7 @@ def test_skin_is_looked_for_where_cloth_slid_but_not_on_another_limb(character):
     near = _near(patch, still, skin, slid)
     assert (reach(slid, near) <= reach(slid, usual) + 1e-6).all()
     found, control = reach(slid, near)[thigh], reach(slid, usual)[thigh]
-    assert np.median(found) < 0.5 * np.median(control)
+    assert np.median(found) < 0.6 * np.median(control)
     # Each shin's cloth at the other shin, where all skin nearby is the other's.
     crossed = still * np.array([-1.0, 1.0, 1.0], np.float32)
     shin = still[:, 1] < still[:, 1].min() + 0.2

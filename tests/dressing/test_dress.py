@@ -95,3 +95,17 @@ def test_what_evaluation_measures_is_what_dress_gives(push):
     lead = predictor.config.inputs.window - 1
     np.testing.assert_allclose(measured[lead:], clip.garments[0].positions[lead:], atol=2e-5)
     assert np.abs(measured[:lead] - clip.garments[0].positions[:lead]).max() < 0.05
+
+
+@pytest.mark.parametrize("start", [0.1, 1.0])
+def test_a_part_of_a_motion_is_dressed_as_in_the_whole(start):
+    """What was before its first frame is the motion's own, not made up."""
+    first = round(30 * start)
+    (whole,) = dress("punch", ["top"], frames=first + 4, push_out=False).garments
+    (part,) = dress("punch", ["top"], start=start, frames=4, push_out=False).garments
+    np.testing.assert_allclose(part.positions, whole.positions[first:], atol=1e-5)
+    # The control: the same frames as a motion of their own.
+    clip = load_motion("punch", fps=30.0)
+    alone = dataclasses.replace(clip, rotations=clip.rotations[first:], root=clip.root[first:])
+    (other,) = dress(alone, ["top"], frames=4, push_out=False).garments
+    assert np.abs(other.positions - whole.positions[first:]).max() > 1e-3

@@ -16,9 +16,10 @@ from physxnet_jax.dressing import (
     tuck_in,
     unbound_wearable,
 )
-from physxnet_jax.dressing._push_out import _off_skin
+from physxnet_jax.dressing._push_out import _off_skin, _posed, faces_at_rest, faces_near
+from physxnet_jax.dressing._skirt import skin_foot
 from physxnet_jax.garment import template
-from physxnet_jax.geometry import each_frame, mesh_edges
+from physxnet_jax.geometry import TriMesh, closest_points, each_frame, mesh_edges
 from physxnet_jax.models import skin_wearable
 from physxnet_jax.motion import clip_transforms, load_motion
 
@@ -62,6 +63,40 @@ def test_what_is_inside_is_lifted_and_nothing_else_is_touched(body, rest, balanc
     lifted = push_out(patch, sunk, *balance)
     after = np.asarray(skin_height(patch, lifted, *balance)[0])
     assert np.mean(after > -1e-3) > 0.97
+
+
+@pytest.mark.parametrize("name", ["top", "bottom"])
+def test_the_skin_next_to_cloth_is_found_where_the_cloth_is(body, rest, name):
+    """A knee drawn up, the back bent, an arm laid on."""
+    wearable, patch = fitted(body, rest, name)
+    q = jnp.zeros((31, 4)).at[:, 0].set(1.0)
+    for joint, axis, angle in (
+        ("LeftUpLeg", 0, -2.0),
+        ("LeftLeg", 0, 2.2),
+        ("LowerBack", 0, 0.6),
+        ("RightArm", 2, 0.7),
+    ):
+        half = 0.5 * angle
+        turned = jnp.zeros(4).at[0].set(np.cos(half)).at[1 + axis].set(np.sin(half))
+        q = q.at[body.joint(joint)].set(turned)
+    r, t = body.transforms(rest, q, jnp.zeros(3))
+    # Cloth that a network left up to some centimetres beside its place.
+    x = skin_wearable(wearable, r, t)
+    x = x + 0.03 * jax.random.normal(jax.random.key(0), x.shape)
+    skin, normals = _posed(patch, r, t)
+    whole = closest_points(TriMesh(skin, patch.faces), x)
+    feet = jnp.sum(whole.weights[..., None] * skin[patch.faces[whole.face]], axis=1)
+    least = jnp.linalg.norm(feet - x, axis=1)
+
+    def within(candidates):
+        """Share of the vertices whose nearest skin is a candidate, to a millimetre."""
+        foot, _ = skin_foot(skin, normals, patch.faces, x, candidates)
+        return float(jnp.mean(jnp.linalg.norm(foot - x, axis=1) < least + 1e-3))
+
+    # The rest is nearest to another limb, from which it must not be pushed.
+    assert within(faces_near(patch, skin, x)) > 0.85
+    # The control: skin that was near at rest.
+    assert within(faces_at_rest(patch)) < 0.7
 
 
 def test_a_leg_that_comes_forward_carries_the_front_of_a_skirt(body, rest, stride):

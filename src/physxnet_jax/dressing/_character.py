@@ -26,7 +26,7 @@ from ..motion import (
     read_joint_map,
     resample,
 )
-from ._push_out import SkinPatch, push_out_of
+from ._push_out import SkinPatch, faces_at_rest, push_out_of
 
 # Skin whose leftover movement a garment vertex takes over: so many vertices, over so far [m].
 _SKIN, _WIDTH = 24, 0.03
@@ -284,7 +284,9 @@ def clear_of_character(
     rise = character.rise[np.asarray(patch.used)][np.asarray(patch.faces)].max(axis=1)
     least = np.array(patch.least)
     least += np.quantile(rise, 0.95).astype(least.dtype)
-    least[lying] = np.asarray(patch.least)[lying] + rise[np.asarray(patch.candidates)].max(axis=1)
+    least[lying] = np.asarray(patch.least)[lying] + rise[np.asarray(faces_at_rest(patch))].max(
+        axis=1
+    )
     most = np.maximum(np.asarray(patch.most), least)
     patch = dataclasses.replace(patch, least=jnp.asarray(least), most=jnp.asarray(most))
     blocks = []
@@ -304,7 +306,7 @@ def _near(
     points: Float[np.ndarray, "lying 3"],
 ) -> Int[np.ndarray, "lying k"]:
     """The nearest triangles that aren't another limb's: those lay farther off at rest."""
-    faces, usual = np.asarray(patch.faces), np.asarray(patch.candidates)
+    faces, usual = np.asarray(patch.faces), np.asarray(faces_at_rest(patch))
     count = min(_LOOKED_THROUGH, len(faces))
     found = np.asarray(KDTree(skin[faces].mean(axis=1)).query(points, k=count)[1])
     place = np.asarray(patch.rest)[faces].mean(axis=1)

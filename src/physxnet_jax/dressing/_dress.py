@@ -31,7 +31,7 @@ from ._layers import make_layers
 from ._meshes import Wear, animated_meshes, worn_garments
 from ._push_out import make_patch, tuck_in
 from ._stages import Stage, Watch
-from ._wanted_clip import wanted_clip
+from ._wanted_clip import cut_clip, wanted_clip
 
 Method = Literal["network", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "lbs", "simulate")
@@ -147,7 +147,8 @@ def dress(
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     with watch("motion"):
         assert not isinstance(motion, Character)
-        clip = wanted_clip(motion, fps=fps, body=body, shape=shape, start=start, frames=frames)
+        whole = wanted_clip(motion, fps=fps, body=body, shape=shape)
+        clip, past = cut_clip(whole, start, frames)
         fault = sudden_turns(body, clip)
         world, shift = clip_transforms(body, rest, clip)
     with watch("garments"):
@@ -182,7 +183,7 @@ def dress(
         positions = simulate_clip(garments, clip, body, shape, accuracy, stages, progress)
         inside_raw = None
     else:
-        before = before_transforms(body, rest, clip, lead_frames(predictor))
+        before = before_transforms(body, rest, clip, lead_frames(predictor), past)
         positions, inside_raw = predict_clip(
             predictor,
             wearables,

@@ -14,16 +14,19 @@ from ..geometry import (
     Stencil,
     TriMesh,
     gaussian_stencil,
+    least_index,
     mesh_edges,
     safe_normalize,
+    spread_points,
     vertex_normals,
 )
 from ..models import Wearable, skin_points
 from ..typing import pytree
 from ._skirt import SkirtPatch, make_skirt_patch, skin_foot, skirt_lift, skirt_meeting
 
-# Triangles compared for each vertex: a patch of about five centimetres.
-_PATCH = 20
+# Places on the skin compared for each vertex, their distance [m], and the triangles around
+# the nearest of them: folds of the body bring skin near that isn't at rest.
+_CHOICES, _SPACING, _PATCH = 24, 0.025, 20
 # Least height of cloth above the skin; of a top above trousers; most of those beneath it [m].
 _GAP, _ABOVE, _BENEATH = 0.005, 0.011, 0.006
 # Tops are over trousers that are this near at rest, and no longer from here on [m].
@@ -47,10 +50,13 @@ class SkinPatch:
         normals: Their unit normals at rest, shape [skin, 3].
         weights: Their skinning weights, shape [skin, joints].
         faces: Triangles over them, shape [faces, 3].
-        candidates: Triangles near each vertex that lies on the skin, shape [lying, k].
+        places: Those of them that are compared first, shape [places].
+        choices: Places near each vertex that lies on the skin, the nearest at rest first,
+            shape [lying, c].
+        table: Triangles around each place, shape [places, k].
         least: Least height above the skin [m], shape [vertices].
         most: Greatest height, for what is worn beneath something [m], shape [vertices].
-        skirt: Legs that hanging cloth may meet; None for what lies on the skin.
+        skirt: Skin that hanging cloth may meet; None for what lies on the skin.
         carry: How a lifted part of a skirt carries its neighbourhood along; likewise.
     """
 
@@ -59,7 +65,9 @@ class SkinPatch:
     normals: Float[Array, "skin 3"]
     weights: Float[Array, "skin joints"]
     faces: Int[Array, "faces 3"]
-    candidates: Int[Array, "lying k"]
+    places: Int[Array, " places"]
+    choices: Int[Array, "lying c"]
+    table: Int[Array, "places k"]
     least: Float[Array, " vertices"]
     most: Float[Array, " vertices"]
     skirt: SkirtPatch | None
@@ -69,7 +77,7 @@ class SkinPatch:
 def make_patch(
     body: Body, rest: Float[Array, "all 3"], wearable: Wearable, garment: TriMesh
 ) -> SkinPatch:
-    """Triangles round the skin point nearest to each vertex at rest.
+    """Triangles round the skin that each vertex is near at rest, or may come near.
 
     Args:
         body: The body.
@@ -80,37 +88,75 @@ def make_patch(
     mesh = body.mesh(rest[:NUM_BODY_VERTICES])
     faces = np.asarray(mesh.faces)
     points = np.asarray(wearable.rest)
-    middles = np.asarray(mesh.vertices)[faces].mean(axis=1)
+    vertices = np.asarray(mesh.vertices)
     lying = points
     skirt = carry = None
     if wearable.template == "dress":
         carry = gaussian_stencil(points, np.asarray(garment.faces), _CARRY)
         skirt = make_skirt_patch(body, rest, wearable, faces, garment, carry)
         lying = points[np.asarray(skirt.lying)]
-    near = KDTree(middles).query(lying, k=_PATCH)[1].reshape(-1, _PATCH)
-    taken = near.ravel()
+    places, choices = _places_near(vertices, lying)
+    table = KDTree(vertices[faces].mean(axis=1)).query(vertices[places], k=_PATCH)[1]
+    table = table.reshape(-1, _PATCH)
+    taken = table.ravel()
     if skirt is not None:
         taken = np.concatenate([taken, np.asarray(skirt.table).ravel()])
     used, local = np.unique(taken, return_inverse=True)
     rows, corners = np.unique(faces[used], return_inverse=True)
     pick = jnp.asarray(rows.astype(np.int32))
+    # In terms of the vertices and triangles that are kept.
     if skirt is not None:
-        # In terms of the vertices and triangles that are kept.
         middle = np.searchsorted(rows, np.asarray(skirt.middles)).astype(np.int32)
-        table = local[near.size :].reshape(skirt.table.shape).astype(np.int32)
-        skirt = dataclasses.replace(skirt, middles=jnp.asarray(middle), table=jnp.asarray(table))
+        around = local[table.size :].reshape(skirt.table.shape).astype(np.int32)
+        skirt = dataclasses.replace(skirt, middles=jnp.asarray(middle), table=jnp.asarray(around))
     return SkinPatch(
         pick,
         mesh.vertices[pick],
         vertex_normals(mesh.vertices, mesh.faces)[pick],
         body.weights[pick],
         jnp.asarray(corners.reshape(-1, 3).astype(np.int32)),
-        jnp.asarray(local[: near.size].reshape(near.shape).astype(np.int32)),
+        jnp.asarray(np.searchsorted(rows, places).astype(np.int32)),
+        jnp.asarray(choices.astype(np.int32)),
+        jnp.asarray(local[: table.size].reshape(table.shape).astype(np.int32)),
         jnp.asarray(least_height(points, np.asarray(garment.faces))),
         jnp.full((len(points),), jnp.inf, jnp.float32),
         skirt,
         carry,
     )
+
+
+def _places_near(
+    skin: Float[np.ndarray, "body 3"], points: Float[np.ndarray, "lying 3"]
+) -> tuple[Int[np.ndarray, " places"], Int[np.ndarray, "lying c"]]:
+    """Vertices all over the skin, and which of them each point is near."""
+    spread = spread_points(skin, _SPACING)
+    count = min(_CHOICES, len(spread))
+    near = KDTree(skin[spread]).query(points, k=count)[1].reshape(-1, count)
+    kept, choices = np.unique(near, return_inverse=True)
+    return spread[kept], choices.reshape(near.shape)
+
+
+def faces_at_rest(patch: SkinPatch) -> Int[Array, "lying k"]:
+    """Triangles around the place that each lying vertex is nearest to at rest."""
+    return patch.table[patch.choices[:, 0]]
+
+
+def faces_near(
+    patch: SkinPatch, skin: Float[Array, "skin 3"], points: Float[Array, "lying 3"]
+) -> Int[Array, "lying k"]:
+    """Triangles around the nearest place of each lying vertex, in a pose.
+
+    Args:
+        patch: The skin near each vertex.
+        skin: Where it is [m].
+        points: Lying vertices [m].
+    """
+    # Number by number, points last, as CPUs like it; which place it is needs no derivative.
+    places, p = jax.lax.stop_gradient((skin[patch.places].T, points.T))
+    order = patch.choices.T
+    squared = jnp.sum(jnp.stack([q[None] - s[order] for q, s in zip(p, places)]) ** 2, axis=0)
+    near = least_index(squared, axis=0)
+    return patch.table[patch.choices[jnp.arange(near.shape[0]), near]]
 
 
 def least_height(
@@ -172,8 +218,8 @@ def skin_height(
 ) -> tuple[Float[Array, " vertices"], Float[Array, "vertices 3"]]:
     """Height of points above the nearby skin [m] and how they move to clear it [m].
 
-    Hanging cloth is measured against both legs, other cloth against the skin it lay
-    on at rest.
+    Hanging cloth is measured against legs, hips and belly, other cloth against the skin
+    that was within several centimetres of it at rest.
 
     Args:
         patch: The skin near each point.
@@ -181,7 +227,8 @@ def skin_height(
         rotations: World rotations of joints.
         translations: World translations of joints [m].
     """
-    return _clearance(patch, points, _posed(patch, rotations, translations), rotations)
+    posed = _posed(patch, rotations, translations)
+    return _clearance(patch, points, posed, rotations, None)
 
 
 def _posed(patch: SkinPatch, rotations: Array, translations: Array) -> tuple[Array, Array]:
@@ -191,11 +238,17 @@ def _posed(patch: SkinPatch, rotations: Array, translations: Array) -> tuple[Arr
 
 
 def _clearance(
-    patch: SkinPatch, points: Array, posed: tuple[Array, Array], rotations: Array
+    patch: SkinPatch,
+    points: Array,
+    posed: tuple[Array, Array],
+    rotations: Array,
+    candidates: Array | None,
 ) -> tuple[Float[Array, " vertices"], Float[Array, "vertices 3"]]:
     skin, normals = posed
+    on = points if patch.skirt is None else points[patch.skirt.lying]
+    candidates = faces_near(patch, skin, on) if candidates is None else candidates
     if patch.skirt is None:
-        feet = skin_foot(skin, normals, patch.faces, points, patch.candidates)
+        feet = skin_foot(skin, normals, patch.faces, points, candidates)
         return _off_skin(points, feet, patch.least, patch.most)
     lying, rows = patch.skirt.lying, patch.skirt.rows
     turn = blend_rotations(patch.skirt.weights, rotations)
@@ -208,12 +261,12 @@ def _clearance(
         skin,
         normals,
         patch.faces,
-        jnp.concatenate([points[lying], *meeting.points]),
-        jnp.concatenate([patch.candidates, *meeting.candidates]),
+        jnp.concatenate([on, *meeting.points]),
+        jnp.concatenate([candidates, *meeting.candidates]),
     )
     ends = np.cumsum([len(lying), len(rows), len(rows)])
     on_skin, near, front = zip(*(jnp.split(x, ends[:-1]) for x in feet), strict=True)
-    low, lift = _off_skin(points[lying], on_skin, patch.least[lying], patch.most[lying])
+    low, lift = _off_skin(on, on_skin, patch.least[lying], patch.most[lying])
     lifted, above = skirt_lift(meeting, outward, near, front, patch.least[rows])
     order = patch.skirt.order
     return jnp.concatenate([low, above])[order], jnp.concatenate([lift, lifted])[order]
@@ -241,7 +294,7 @@ def push_out(
 ) -> Float[Array, "vertices 3"]:
     """Points moved to the least and greatest height of their patch.
 
-    Continuous while the nearest patch of skin doesn't change. Cloth on the skin moves
+    Continuous while the nearest place on the skin doesn't change. Cloth on the skin moves
     along the skin's normal; vertices deeper than four centimetres are left alone, in
     the last centimetre before it the lift fades out. Hanging cloth is carried by the
     legs, see `skirt_lift`: once smoothly, then exactly.
@@ -252,7 +305,7 @@ def push_out(
         rotations: World rotations of joints.
         translations: World translations of joints [m].
     """
-    return _cleared(patch, points, _posed(patch, rotations, translations), rotations)
+    return _cleared(patch, points, _posed(patch, rotations, translations), rotations, None)
 
 
 def push_out_of(
@@ -271,15 +324,19 @@ def push_out_of(
         skin: Where the patch's skin is [m].
         candidates: Its triangles near each vertex there.
     """
-    near = dataclasses.replace(patch, candidates=candidates)
-    return _cleared(near, points, (skin, vertex_normals(skin, patch.faces)), rotations)
+    posed = skin, vertex_normals(skin, patch.faces)
+    return _cleared(patch, points, posed, rotations, candidates)
 
 
 def _cleared(
-    patch: SkinPatch, points: Array, posed: tuple[Array, Array], rotations: Array
+    patch: SkinPatch,
+    points: Array,
+    posed: tuple[Array, Array],
+    rotations: Array,
+    candidates: Array | None,
 ) -> Float[Array, "vertices 3"]:
-    move = _clearance(patch, points, posed, rotations)[1]
+    move = _clearance(patch, points, posed, rotations, candidates)[1]
     if patch.carry is None:
         return points + move
     points = points + patch.carry @ move
-    return points + _clearance(patch, points, posed, rotations)[1]
+    return points + _clearance(patch, points, posed, rotations, candidates)[1]

@@ -1,4 +1,4 @@
-"""Legs in a skirt: which skin a hanging vertex may meet, and the way out of it."""
+"""The body in a skirt: which skin a hanging vertex may meet, and the way out of it."""
 
 import dataclasses
 import functools
@@ -38,7 +38,7 @@ _NOWHERE = 1e3
 @pytree
 @dataclasses.dataclass(frozen=True)
 class SkirtPatch:
-    """Skin that hanging cloth may meet: both legs.
+    """Skin that hanging cloth may meet: both legs, hips and belly.
 
     Attributes:
         rows: Hanging garment vertices, shape [hanging].
@@ -77,7 +77,7 @@ def make_skirt_patch(
     garment: TriMesh,
     carry: Stencil,
 ) -> SkirtPatch:
-    """Lists the skin near each hanging vertex, over both legs.
+    """Lists the skin near each hanging vertex, over legs, hips and belly.
 
     Args:
         body: The body.
@@ -99,8 +99,8 @@ def make_skirt_patch(
     if len(rows):
         middle = points[rows].mean(axis=0) * [1, 0, 1]
         outward *= np.sign(np.mean(np.sum(outward * (points[rows] - middle), axis=1)))
-    legs = np.flatnonzero(_leg_share(body)[:NUM_BODY_VERTICES] > 0.3)
-    chosen = legs[spread_points(skin[legs], _SPACING)]
+    below = np.flatnonzero(_share_below_waist(body)[:NUM_BODY_VERTICES] > 0.3)
+    chosen = below[spread_points(skin[below], _SPACING)]
     k = min(_CHOICES, len(chosen))
     near = KDTree(skin[chosen]).query(points[rows], k=k)[1].reshape(len(rows), k)
     compared = np.zeros((len(rows), len(chosen)), dtype=bool)
@@ -119,11 +119,12 @@ def make_skirt_patch(
     )
 
 
-def _leg_share(body: Body) -> Float[np.ndarray, " all"]:
-    names = ("UpLeg", "Leg", "Foot", "ToeBase")
-    return np.asarray(body.weights)[
-        :, [body.joint(f"{side}{n}") for side in ("Left", "Right") for n in names]
-    ].sum(axis=1)
+def _share_below_waist(body: Body) -> Float[np.ndarray, " all"]:
+    legs = ("UpLeg", "Leg", "Foot", "ToeBase")
+    names = [f"{side}{n}" for side in ("Left", "Right") for n in legs]
+    # Whoever bends over has the belly in the skirt.
+    names += ["Hips", "LHipJoint", "RHipJoint", "LowerBack"]
+    return np.asarray(body.weights)[:, [body.joint(n) for n in names]].sum(axis=1)
 
 
 class Meeting(NamedTuple):

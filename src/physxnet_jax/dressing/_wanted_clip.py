@@ -40,8 +40,6 @@ def wanted_clip(
         MotionError: What can't be read; fewer than one frame; a start behind the end; what
             is said of a file where there is none.
     """
-    if frames is not None and frames < 1:
-        raise MotionError(f"frames is {frames}; ask for at least one.")
     if isinstance(motion, Motion):
         of_files = {"source_fps": source_fps, "skeleton": skeleton, "joint_map": joint_map}
         told = [name for name, value in of_files.items() if value is not None]
@@ -64,14 +62,33 @@ def wanted_clip(
             body=body,
             shape=shape,
         )
+    return cut_clip(clip, start, frames)[0]
+
+
+def cut_clip(clip: Motion, start: float, frames: int | None) -> tuple[Motion, Motion]:
+    """A part of a motion, and what of it comes before.
+
+    Args:
+        clip: The motion.
+        start: Where in it to begin [s].
+        frames: Keep only this many frames.
+
+    Raises:
+        MotionError: Fewer than one frame; a start behind the end.
+    """
+    if frames is not None and frames < 1:
+        raise MotionError(f"frames is {frames}; ask for at least one.")
     first = start * clip.fps
     if not 0.0 <= first < clip.num_frames:
         raise MotionError(
             f"start is {start} s, but {clip.name or 'the motion'} lasts from 0 to"
             f" {clip.num_frames / clip.fps:.2f} s."
         )
-    if first == 0 and frames is None:
-        return clip
     begin = min(round(first), clip.num_frames - 1)
-    kept = slice(begin, None if frames is None else begin + frames)
-    return dataclasses.replace(clip, rotations=clip.rotations[kept], root=clip.root[kept])
+    end = clip.num_frames if frames is None else min(begin + frames, clip.num_frames)
+
+    def part(kept: slice) -> Motion:
+        return dataclasses.replace(clip, rotations=clip.rotations[kept], root=clip.root[kept])
+
+    whole = (begin, end) == (0, clip.num_frames)
+    return clip if whole else part(slice(begin, end)), part(slice(0, begin))

@@ -73,13 +73,32 @@ def poses_before(
 
 
 def before_transforms(
-    body: Body, rest: Float[Array, "all 3"], motion: Motion, count: int
+    body: Body,
+    rest: Float[Array, "all 3"],
+    motion: Motion,
+    count: int,
+    past: Motion | None = None,
 ) -> tuple[Float[np.ndarray, "before joints 3 3"], Float[np.ndarray, "before joints 3"]]:
-    """`clip_transforms` of `poses_before`."""
+    """`clip_transforms` of what was before a clip.
+
+    Args:
+        body: The body.
+        rest: Its rest vertices [m].
+        motion: The clip.
+        count: Frames wanted.
+        past: Those of the same motion that come before it; what lies before them is
+            `poses_before`.
+    """
     joints = len(body.parents)
     if count == 0:
         return np.zeros((0, joints, 3, 3), np.float32), np.zeros((0, joints, 3), np.float32)
-    q, p = poses_before(jnp.asarray(motion.rotations), jnp.asarray(motion.root), count)
+    q, p = jnp.asarray(motion.rotations), jnp.asarray(motion.root)
+    known = 0 if past is None else min(count, past.num_frames)
+    if past is not None and known:
+        q = jnp.concatenate([jnp.asarray(past.rotations)[-known:], q])
+        p = jnp.concatenate([jnp.asarray(past.root)[-known:], p])
+    early = poses_before(q, p, count - known)
+    q, p = (jnp.concatenate([a, b[:known]]) for a, b in zip(early, (q, p), strict=True))
     return clip_transforms(body, rest, Motion(q, p, motion.fps, motion.name))
 
 
