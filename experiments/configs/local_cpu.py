@@ -4,7 +4,7 @@ Command: physxnet train experiments/configs/local_cpu.py --name local
          --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed
          --data runs/mixed_extra --data runs/mixed_left_out --data runs/varied
          --splits train extra --out runs/local
-Cost:    41 minutes on two cores, some of it beside other work: 12,176 steps.
+Cost:    27 minutes on two cores, some of it beside other work: 12,176 steps.
 Result:  the rows `local` of experiments/results/test_errors.md. It has seen 16 actions that
          the paper's protocol doesn't have, what the protocol leaves out of its clips, and
          both mixed, slowed and exaggerated; `local_22_cpu.py` has not.

@@ -4,7 +4,7 @@ Command: physxnet train experiments/configs/local_muon_cpu.py --name local-muon
          --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed
          --data runs/mixed_extra --data runs/mixed_left_out --data runs/varied
          --splits train extra --out runs/local-muon
-Cost:    39 minutes on two cores, some of it beside other work: 12,176 steps.
+Cost:    26 minutes on two cores, some of it beside other work: 12,176 steps.
 Result:  the rows `local-muon` of experiments/results/test_errors.md, and half of `pair`.
 """
 

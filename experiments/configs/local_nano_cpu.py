@@ -4,7 +4,7 @@ Command: physxnet train experiments/configs/local_nano_cpu.py --name nano
          --data runs/ours --data runs/extra --data runs/left_out --data runs/mixed
          --data runs/mixed_extra --data runs/mixed_left_out --data runs/varied
          --splits train extra --out runs/nano
-Cost:    28 minutes of one core beside other work: 12,176 steps.
+Cost:    14 minutes on two cores beside other work: 12,176 steps.
 Result:  the rows `nano` of experiments/results/test_errors.md: the recipe and the data of
          `local_cpu.py`.
 """

@@ -103,6 +103,10 @@ def make_skirt_patch(
     chosen = below[spread_points(skin[below], _SPACING)]
     k = min(_CHOICES, len(chosen))
     near = KDTree(skin[chosen]).query(points[rows], k=k)[1].reshape(len(rows), k)
+    # Those that nothing is near cost as much as all others.
+    if len(rows):
+        kept, near = np.unique(near, return_inverse=True)
+        chosen, near = chosen[kept], near.reshape(len(rows), k)
     compared = np.zeros((len(rows), len(chosen)), dtype=bool)
     np.put_along_axis(compared, near, True, axis=1)
     table = KDTree(skin[faces].mean(axis=1)).query(skin[chosen], k=_PATCH)[1]
