@@ -40,13 +40,13 @@ def loss(angle):
 
 
 angle = jnp.float32(0.1)
-optimiser = optax.adam(optax.cosine_decay_schedule(0.05, 60))
+optimiser = optax.adam(optax.cosine_decay_schedule(0.05, 120))
 state = optimiser.init(angle)
 step = jax.jit(jax.value_and_grad(loss))
-for k in range(60):
+for k in range(120):
     value, slope = step(angle)
     change, state = optimiser.update(slope, state)
     angle = optax.apply_updates(angle, change)
-    if k % 10 == 0:
+    if k % 20 == 0:
         print(f"step {k:2d}: {float(value):10.3f} mm^2, knee at {float(angle):.3f} rad")
 print(f"found {float(angle):.3f} rad; hidden were 0.600")
