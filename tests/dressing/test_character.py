@@ -182,8 +182,9 @@ def test_skin_is_looked_for_where_cloth_slid_but_not_on_another_limb(character):
     slid = still - np.array([0.0, 0.08, 0.0], np.float32)
     near = _near(patch, still, skin, slid)
     assert (reach(slid, near) <= reach(slid, usual) + 1e-6).all()
-    found, control = reach(slid, near)[thigh], reach(slid, usual)[thigh]
-    assert np.median(found) < 0.6 * np.median(control)
+    at_rest = KDTree(middle).query(still, k=usual.shape[1])[1]
+    found, control = reach(slid, near)[thigh], reach(slid, at_rest)[thigh]
+    assert np.median(found) < 0.5 * np.median(control)
     # Each shin's cloth at the other shin, where all skin nearby is the other's.
     crossed = still * np.array([-1.0, 1.0, 1.0], np.float32)
     shin = still[:, 1] < still[:, 1].min() + 0.2
