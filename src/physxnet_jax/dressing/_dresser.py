@@ -152,9 +152,9 @@ def make_dresser(
 def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
     """The same clothes on a body of another shape; pure, for `jax.vmap` and `jax.grad` by it.
 
-    Garments follow the shape as `Garment.rest_vertices` carries them. Without push-out it
-    is what `make_dresser` gives for the shape; push-out compares the skin that was near on
-    the shape before.
+    Garments follow the shape as `Garment.rest_vertices` carries them. A garment alone is what
+    `make_dresser` gives for the shape; of several, how much room is left between them is
+    that of the shape before.
 
     Args:
         dresser: From `make_dresser`.

@@ -79,21 +79,25 @@ def make_patch(
 ) -> SkinPatch:
     """Triangles round the skin that each vertex is near at rest, or may come near.
 
+    Which they are, and how far a vertex stands off, is told on the default shape, where
+    garments are modelled; other shapes carry it along.
+
     Args:
         body: The body.
         rest: Its rest vertices [m].
         wearable: The garment on it.
-        garment: The garment's mesh, whose edges decide how far it stands off.
+        garment: The garment's mesh on the default shape, whose edges decide how far it
+            stands off.
     """
-    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
-    faces = np.asarray(mesh.faces)
-    points = np.asarray(wearable.rest)
-    vertices = np.asarray(mesh.vertices)
+    modelled = body.rest_vertices(body.default_shape())
+    faces = np.asarray(body.mesh(modelled[:NUM_BODY_VERTICES]).faces)
+    points = np.asarray(garment.vertices)
+    vertices = np.asarray(modelled)[:NUM_BODY_VERTICES]
     lying = points
     skirt = carry = None
     if wearable.template == "dress":
         carry = gaussian_stencil(points, np.asarray(garment.faces), _CARRY)
-        skirt = make_skirt_patch(body, rest, wearable, faces, garment, carry)
+        skirt = make_skirt_patch(body, modelled, wearable, faces, garment, carry)
         lying = points[np.asarray(skirt.lying)]
     places, choices = _places_near(vertices, lying)
     table = KDTree(vertices[faces].mean(axis=1)).query(vertices[places], k=_PATCH)[1]
@@ -109,6 +113,7 @@ def make_patch(
         middle = np.searchsorted(rows, np.asarray(skirt.middles)).astype(np.int32)
         around = local[table.size :].reshape(skirt.table.shape).astype(np.int32)
         skirt = dataclasses.replace(skirt, middles=jnp.asarray(middle), table=jnp.asarray(around))
+    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
     return SkinPatch(
         pick,
         mesh.vertices[pick],

@@ -81,19 +81,19 @@ def make_skirt_patch(
 
     Args:
         body: The body.
-        rest: Its rest vertices [m].
+        rest: Its rest vertices on the default shape [m].
         wearable: A dress.
         faces: Triangles of the whole body.
-        garment: The dress's mesh.
+        garment: The dress's mesh on that shape.
         carry: Mean over neighbourhoods of the dress.
 
     Returns:
         The patch, in terms of body vertices and faces.
     """
     skin = np.asarray(rest)[:NUM_BODY_VERTICES]
-    points = np.asarray(wearable.rest)
+    points = np.asarray(garment.vertices)
     rows = hanging_vertices(body, np.asarray(rest), points)
-    normals = carry @ vertex_normals(wearable.rest, garment.faces)
+    normals = carry @ vertex_normals(garment.vertices, garment.faces)
     outward = np.asarray(safe_normalize(normals))[rows]
     # Some files have their faces inside out.
     if len(rows):
