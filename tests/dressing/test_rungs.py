@@ -119,7 +119,8 @@ def test_the_slope_by_the_pose_is_the_differences_at_every_rung(dresser, motion,
     # In the middle of the punch: at its start random weights hardly move the leg of `paper`.
     rotations, root = (x[3:5] for x in motion)
     knee = dresser.body.joint("LeftLeg")
-    rng = np.random.default_rng(0)
+    # A way that moves the leg at every rung by far more than differences are off.
+    rng = np.random.default_rng(3)
     leaves, tree = jax.tree.flatten(person.predictor.state)
     noise = [
         jnp.asarray(rng.normal(0.0, 1.0, x.shape).astype(np.float32)) * jnp.std(x) for x in leaves
@@ -147,7 +148,7 @@ def test_the_slope_by_the_pose_is_the_differences_at_every_rung(dresser, motion,
             ends.append(float(height(*there)))
         difference = (ends[0] - ends[1]) / (2 * step)
         assert float(slopes[k]) == pytest.approx(difference, rel=near, abs=1e-4)
-        assert abs(difference) > 5e-4
+        assert abs(difference) > 1e-3
 
 
 def test_bfloat16_adds_less_than_two_percent_to_the_error(dresser, motion):
