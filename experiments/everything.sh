@@ -29,11 +29,14 @@ physxnet evaluate runs/local-wide runs/local-wide+mirror runs/local-taught runs/
 physxnet train experiments/configs/paper_25_cpu.py --name paper-25 --data runs/ours --out runs/paper-25
 physxnet evaluate lbs paper paper+push runs/paper-25 runs/paper-25+push --data runs/ours --out experiments/results/paper_longer.json
 physxnet dataset build experiments/configs/dataset_blender.py --out runs/blender
+physxnet dataset build experiments/configs/dataset_blender_extra.py --out runs/blender_extra
+physxnet train experiments/configs/local_22_cpu.py --name blender-22 --data runs/blender --out runs/blender-22
+physxnet train experiments/configs/paper_cpu.py --name paper-blender --data runs/blender --out runs/paper-blender
 python experiments/ablations.py
 python experiments/previous_offset.py
 python experiments/mirrored_answer.py
 python experiments/cloth_memory.py
 python experiments/clip_start.py
 python experiments/unseen.py
-python experiments/reproduce.py --data runs/blender --methods lbs nearest mlp nano small local local+push pair+mirror paper paper+push draft standard
+python experiments/reproduce.py --data runs/blender --learn-from runs/blender --methods lbs nearest mlp runs/blender-22 runs/blender-22+push runs/local-22 nano small local local+push pair+mirror paper paper+push runs/paper-blender draft standard
 python experiments/reproduce.py --data runs/ours

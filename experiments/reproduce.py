@@ -1,8 +1,9 @@
 """The paper's experiment: every number and figure of docs/reproduction.md.
 
 Command: python experiments/reproduce.py --data runs/ours
-         --data runs/blender --methods lbs nearest mlp nano small local local+push pair+mirror
-         paper paper+push draft standard (if it is built; nearest and mlp learn from runs/ours)
+         --data runs/blender --learn-from runs/blender --methods lbs nearest mlp runs/blender-22
+         runs/blender-22+push runs/local-22 nano small local local+push pair+mirror paper
+         paper+push runs/paper-blender draft standard (if it is built)
 Cost:    about 40 minutes on two cores for all methods (penetration and the simulator take most
          of it); goes on where it was stopped.
 Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png;
@@ -39,6 +40,7 @@ METHODS = (
     "nearest",
     "mlp",
     "runs/local-22",
+    "runs/blender-22",
     *(
         f"{n}{m}{p}"
         for n in ("nano", "small", "local", "pair")
@@ -74,8 +76,19 @@ SHORT = {
 }
 # What docs/reproduction.md shows action by action; all of it is in test_errors.md.
 EACH_ACTION = (
-    *("lbs", "nearest", "mlp", "local-22", "nano", "small", "local", "local+relax+push"),
-    *("pair+mirror", "pair+mirror+relax+push", "paper", "paper+push", "draft", "standard", "noise"),
+    *(
+        "lbs",
+        "nearest",
+        "mlp",
+        "local-22",
+        "blender-22",
+        "blender-22+push",
+        "nano",
+        "small",
+        "local",
+    ),
+    *("local+relax+push", "pair+mirror", "pair+mirror+relax+push", "paper", "paper+push"),
+    *("paper-blender", "draft", "standard", "noise"),
 )
 # Whose errors are told over those of skinning.
 SHARES = (
@@ -83,7 +96,10 @@ SHARES = (
     *("pair+mirror+relax+push", "noise"),
 )
 OURS = "physxnet"
-NETWORKS = ("local-22", "nano", "small", "local", "local-muon", "pair", "paper")
+NETWORKS = (
+    *("local-22", "blender-22", "nano", "small", "local", "local-muon", "pair", "paper"),
+    "paper-blender",
+)
 SETS = {
     "ours": "protocol",
     "extra": "extra actions",
@@ -99,6 +115,7 @@ SETS = {
     "taught_a": "answered by networks: legs of all with other upper bodies, slower and wider",
     "taught_b": "answered by networks: legs of all with yet others, faster and wider",
     "blender": "protocol, Blender",
+    "blender_extra": "extra actions, Blender",
 }
 SOFT = ("moon walk", "balancing", "walking")
 ABRUPT = ("strong gesture", "jump", "punch")

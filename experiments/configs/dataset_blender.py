@@ -1,10 +1,10 @@
 """The protocol's 34 actions through Blender's cloth, the paper's own engine.
 
-Command: PHYSXNET_BLENDER=... physxnet dataset build experiments/configs/dataset_blender.py
-         --out runs/blender --shard 0/2 (and 1/2 beside it)
-Cost:    1.0 to 1.3 seconds a frame and garment, so 4.6 hours of one core or half as long in
-         two shards. 86 of the 102 garments are built (13,411 s beside other work): all tops
-         and trousers, the dress in the test actions and in six of training.
+Command: PHYSXNET_BLENDER=... taskset -c 0 physxnet dataset build
+         experiments/configs/dataset_blender.py --out runs/blender --shard 0/2
+         (and -c 1, 1/2 beside it)
+Cost:    0.6 (trousers) to 0.9 (dress) seconds a frame and garment with nothing else running,
+         1.0 to 1.3 beside other work and not bound to cores; 15,022 s in all, of both kinds.
 Result:  cotton preset, quality 10 without self-collision. Sleeves may come off arms that
          pass close to the body.
 """

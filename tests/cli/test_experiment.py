@@ -83,6 +83,13 @@ def test_build_train_evaluate(tmp_path, capsys):
     (tmp_path / "old.json").write_text(json.dumps(changed))
     assert main([*measure[:-1], str(tmp_path / "old.json"), "--quiet"]) == 2
     assert "another simulation" in capsys.readouterr().err
+    # What a baseline learned from counts where the same engine is the reference.
+    learned = rows[0] | {"method": "nearest", "weights": 16 * "0"}
+    near = ["evaluate", "nearest", *measure[4:-1], str(tmp_path / "near.json"), "--quiet"]
+    for engine, code in (("physxnet", 2), ("blender", 0)):
+        (tmp_path / "near.json").write_text(json.dumps([learned | {"engine": engine}]))
+        assert main(near) == code
+    assert "training set" in capsys.readouterr().err
     for broken in ("{", "[1]", '[{"method": "lbs"}]'):
         (tmp_path / "old.json").write_text(broken)
         assert main([*measure[:-1], str(tmp_path / "old.json"), "--quiet"]) == 2
