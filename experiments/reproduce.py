@@ -76,19 +76,9 @@ SHORT = {
 }
 # What docs/reproduction.md shows action by action; all of it is in test_errors.md.
 EACH_ACTION = (
-    *(
-        "lbs",
-        "nearest",
-        "mlp",
-        "local-22",
-        "blender-22",
-        "blender-22+push",
-        "nano",
-        "small",
-        "local",
-    ),
-    *("local+relax+push", "pair+mirror", "pair+mirror+relax+push", "paper", "paper+push"),
-    *("paper-blender", "draft", "standard", "noise"),
+    *("lbs", "nearest", "mlp", "local-22", "blender-22", "blender-22+push", "nano", "small"),
+    *("local", "local+relax+push", "pair+mirror", "pair+mirror+relax+push"),
+    *("paper", "paper+push", "paper-blender", "draft", "standard", "noise"),
 )
 # Whose errors are told over those of skinning.
 SHARES = (
@@ -97,8 +87,8 @@ SHARES = (
 )
 OURS = "physxnet"
 NETWORKS = (
-    *("local-22", "blender-22", "nano", "small", "local", "local-muon", "pair", "paper"),
-    "paper-blender",
+    *("local-22", "blender-22", "nano", "small", "local", "local-muon", "pair"),
+    *("paper", "paper-blender"),
 )
 SETS = {
     "ours": "protocol",

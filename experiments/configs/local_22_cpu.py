@@ -3,7 +3,8 @@
 Command: physxnet train experiments/configs/local_22_cpu.py --name local-22
          --data runs/ours --out runs/local-22
 Cost:    29 minutes beside other work on two cores: 6,144 steps.
-Result:  the rows `local-22` of experiments/results/test_errors.md.
+Result:  the rows `local-22` of experiments/results/test_errors.md; with --data runs/blender the
+         rows `blender-22`.
 """
 
 import dataclasses

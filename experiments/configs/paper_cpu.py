@@ -3,7 +3,8 @@
 Command: physxnet train experiments/configs/paper_cpu.py --name paper --data runs/ours
          --out runs/paper
 Cost:    about 6 minutes on two cores.
-Result:  the rows `paper` of experiments/results/test_errors.md.
+Result:  the rows `paper` of experiments/results/test_errors.md; with --data runs/blender the
+         rows `paper-blender`.
 
 World frame, 18 channels, batch norm, adversarial and L1 loss, soft and flipped labels, as
 in the paper. Smaller are the maps (64 x 64 for 256 x 256), the width and the number of

@@ -89,8 +89,9 @@ def make_patch(
         garment: The garment's mesh on the default shape, whose edges decide how far it
             stands off.
     """
+    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
+    faces = np.asarray(mesh.faces)
     modelled = body.rest_vertices(body.default_shape())
-    faces = np.asarray(body.mesh(modelled[:NUM_BODY_VERTICES]).faces)
     points = np.asarray(garment.vertices)
     vertices = np.asarray(modelled)[:NUM_BODY_VERTICES]
     lying = points
@@ -113,7 +114,6 @@ def make_patch(
         middle = np.searchsorted(rows, np.asarray(skirt.middles)).astype(np.int32)
         around = local[table.size :].reshape(skirt.table.shape).astype(np.int32)
         skirt = dataclasses.replace(skirt, middles=jnp.asarray(middle), table=jnp.asarray(around))
-    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
     return SkinPatch(
         pick,
         mesh.vertices[pick],
