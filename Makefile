@@ -1,5 +1,5 @@
 # Two commands matter: `make demo` and `make test`. Both set up .venv by themselves.
-# `make test-all` runs slow tests too, which look longer at what others look at as well.
+# `make test-release` runs the longer tests, which CI runs too; `make test-nightly` the longest.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -8,7 +8,7 @@ SRC := $(shell find src tests experiments -name '*.py' 2>/dev/null)
 # Many processes load the same libraries: the first leaves them compiled.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-all check docs format clean
+.PHONY: demo test test-release test-nightly check docs format clean
 
 # One environment serves all targets; uv.lock decides every version.
 $(VENV)/.ready: pyproject.toml uv.lock
@@ -24,14 +24,23 @@ demo: $(VENV)/.ready
 test: $(VENV)/.ready
 	$(BIN)/python -m pytest
 
-test-all: $(VENV)/.ready
-	$(BIN)/python -m pytest -m "slow or not slow"
+test-release: $(VENV)/.ready
+	$(BIN)/python -m pytest -m release
+
+# On this Python the longest tests; on the others the quick ones.
+NIGHTLY_PYTHONS ?= python3.12 python3.13
+test-nightly: $(VENV)/.ready
+	$(BIN)/python -m pytest -m nightly
+	for python in $(NIGHTLY_PYTHONS); do \
+		$(MAKE) test PYTHON=$$python VENV=.venv-$$python || exit 1; \
+	done
 
 check: $(VENV)/.ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+	$(BIN)/python tests/check_words.py
 
 docs: $(VENV)/.ready
 	$(BIN)/python -m sphinx -W -q -b html docs docs/_build/html

@@ -11,13 +11,15 @@ import numpy as np
 
 import physxnet_jax as px
 
-dresser = px.make_dresser(["top", "bottom"], weights="nano")
+dresser = px.make_dresser(
+    ["top", "bottom"], inference=px.Inference(weights="nano", strain_iterations=0)
+)
 motion = px.load_motion("walk", fps=30)
 # The stream is used up: its memory serves the next one.
-step = jax.jit(functools.partial(px.clothe_frame, fps=30.0), donate_argnums=1)
+step = jax.jit(functools.partial(px.clothe_step, fps=30.0), donate_argnums=1)
 
 # Who comes in moving would be told by the first few poses; here the first one is all there is.
-stream = px.start_clothing(dresser, motion.rotations[0], motion.root[0])
+stream = px.init_stream(dresser, motion.rotations[0], motion.root[0])
 times = []
 for rotations, root in zip(motion.rotations, motion.root, strict=True):
     began = time.perf_counter()

@@ -12,7 +12,7 @@ import optax
 
 import physxnet_jax as px
 
-dresser = px.make_dresser(["bottom"], weights="nano")
+dresser = px.make_dresser(["bottom"], inference=px.Inference(weights="nano", strain_iterations=0))
 body = px.load_body()
 knee = body.joint_names.index("LeftLeg")
 motion = px.load_motion("balance", fps=30)
@@ -40,12 +40,12 @@ def loss(angle):
 
 
 angle = jnp.float32(0.1)
-optimiser = optax.adam(optax.cosine_decay_schedule(0.05, 120))
-state = optimiser.init(angle)
+optimizer = optax.adam(optax.cosine_decay_schedule(0.05, 120))
+state = optimizer.init(angle)
 step = jax.jit(jax.value_and_grad(loss))
 for k in range(120):
     value, slope = step(angle)
-    change, state = optimiser.update(slope, state)
+    change, state = optimizer.update(slope, state)
     angle = optax.apply_updates(angle, change)
     if k % 20 == 0:
         print(f"step {k:2d}: {float(value):10.3f} mm^2, knee at {float(angle):.3f} rad")

@@ -17,17 +17,15 @@ import physxnet_jax as px
 from physxnet_jax.garment import Fabric, square_sheet
 from physxnet_jax.simulation import (
     XPBD,
-    Bend,
     Effect,
-    Gravity,
-    Pin,
     Prepared,
     Scene,
-    Stretch,
     advance,
+    make_system,
     prepare_scene,
     start_state,
 )
+from physxnet_jax.simulation.effects import Bend, Gravity, Pin, Stretch
 
 
 @jax.tree_util.register_dataclass
@@ -58,7 +56,7 @@ FPS, FRAMES = 30.0, 15
 sheet = square_sheet(7, 0.2, pinned=np.arange(7), fabric=Fabric(stretch=500.0, bend=2e-4))
 scene = prepare_scene(Scene((sheet,), (Gravity(), Sway(), Stretch(), Bend(), Pin())))
 solver = XPBD(8, 2)
-system = scene.system(solver)
+system = make_system(scene, solver)
 body = px.load_body()
 rest = body.rest_vertices(body.default_shape())
 # Frames, people side by side, joints: one person who stands still.
@@ -84,11 +82,11 @@ def loss(log_factor):
 
 
 log_factor = jnp.float32(0.0)
-optimiser = optax.adam(optax.cosine_decay_schedule(0.15, 40))
-state = optimiser.init(log_factor)
+optimizer = optax.adam(optax.cosine_decay_schedule(0.15, 40))
+state = optimizer.init(log_factor)
 for k in range(40):
     value, slope = loss(log_factor)
-    change, state = optimiser.update(slope, state)
+    change, state = optimizer.update(slope, state)
     log_factor = optax.apply_updates(log_factor, change)
     if k % 8 == 0:
         print(f"step {k:2d}: {float(value):9.4f} mm^2, {float(jnp.exp(log_factor)):.2f} times")

@@ -24,18 +24,17 @@ import statistics
 import jax
 from rich.progress import Progress
 
-from physxnet_jax.data import Sequence, list_sequences, read_sequence
+from physxnet_jax.data import Sequence, list_sequences, read_sequence, usable_garment
 from physxnet_jax.evaluation import Method, network, skinning, vertex_error
-from physxnet_jax.files import whole_file
+from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import TEMPLATES
-from physxnet_jax.io import save_predictor
-from physxnet_jax.models import Inputs, ModelConfig
-from physxnet_jax.training import TrainConfig, read_metrics, train, usable_garment
+from physxnet_jax.models import FeatureConfig, ModelConfig, save_predictor
+from physxnet_jax.training import TrainConfig, read_metrics, train
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 
 BASE = TrainConfig(
-    model=ModelConfig(Inputs("local"), resolution=64, width=16),
+    model=ModelConfig(FeatureConfig("local"), resolution=64, width=16),
     epochs=3,
     batch=8,
     learning_rate=3e-3,
@@ -60,20 +59,20 @@ VARIANTS: dict[str, tuple[TrainConfig, tuple[str, ...]]] = {
     "base": (BASE, ("data",)),
     "texels alone": (varied(vertex_share=0.0), ("data",)),
     "texels alone, world frame": (
-        varied(vertex_share=0.0, model={"inputs": Inputs("paper")}),
+        varied(vertex_share=0.0, model={"inputs": FeatureConfig("paper")}),
         ("data",),
     ),
     "adversarial": (varied(adversarial=True), ("data",)),
-    "squared": (varied(squared=True), ("data",)),
-    "by Muon": (varied(optimiser="muon"), ("data",)),
+    "squared": (varied(loss="l2"), ("data",)),
+    "by Muon": (varied(optimizer="muon"), ("data",)),
     "differences along edges": (varied(edge_share=0.5), ("data",)),
-    "four scales": (varied(scales=4), ("data",)),
+    "four scales": (varied(pyramid_levels=4), ("data",)),
     "one frame": (varied(model=seen(frames=1)), ("data",)),
     "no acceleration": (varied(model=seen(acceleration=False)), ("data",)),
     "no gravity": (varied(model=seen(gravity=False)), ("data",)),
-    "no place": (varied(model=seen(place=False)), ("data",)),
-    "neither gravity nor place": (varied(model=seen(gravity=False, place=False)), ("data",)),
-    "and mirrored actions": (varied(mirror=True), ("data",)),
+    "no place": (varied(model=seen(position=False)), ("data",)),
+    "neither gravity nor place": (varied(model=seen(gravity=False, position=False)), ("data",)),
+    "and mirrored actions": (varied(mirror_augmentation=True), ("data",)),
     "and extra actions": (BASE, ("data", "extra")),
     "width 32": (varied(model={"width": 32}), ("data",)),
     "128 x 128": (varied(model={"resolution": 128}), ("data",)),
@@ -145,9 +144,9 @@ def main() -> None:
                     }
             if not any(r["variant"] == "lbs" and r["engine"] in engines for r in rows):
                 rows += measure("lbs", skinning(), tests)
-            with whole_file(path) as part:
+            with atomic_write(path) as part:
                 part.write_text(json.dumps(rows, indent=1) + "\n")
-    with whole_file(path.with_suffix(".md")) as part:
+    with atomic_write(path.with_suffix(".md")) as part:
         part.write_text(table(rows) + "\n")
 
 

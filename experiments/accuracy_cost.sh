@@ -5,6 +5,6 @@
 # it in one sitting.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-physxnet bench net --weights nano small local local+relax local+mirror pair pair+mirror paper --garments 1 3 --backward --simulator draft standard fine noise blender --errors experiments/results/test_errors.json --data runs/ours --out experiments/results/accuracy_cost.json
+physxnet bench net --weights nano small local local+relax local+mirror pair pair+mirror paper --garments 1 3 --backward --simulator draft standard fine perturbed blender --errors experiments/results/test_errors.json --data runs/ours --out experiments/results/accuracy_cost.json
 physxnet bench net --weights small --garments 2 --errors experiments/results/test_errors.json --data runs/ours --out experiments/results/accuracy_cost.json
 physxnet bench net --weights small --garments 1 3 --precisions float32 bfloat16 --data runs/ours --out experiments/results/precision.json

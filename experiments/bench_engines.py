@@ -24,14 +24,14 @@ import numpy as np
 from rich.progress import Progress
 
 from physxnet_jax.body import load_body
-from physxnet_jax.dressing import dress, network_costs
-from physxnet_jax.evaluation import ENGINES
-from physxnet_jax.files import whole_file
+from physxnet_jax.dressing import EXTERNAL_ENGINES, Inference, dress
+from physxnet_jax.evaluation import network_costs
+from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import TEMPLATES, template
-from physxnet_jax.io import load_predictor
+from physxnet_jax.models import load_predictor
 from physxnet_jax.motion import Motion, load_motion
 from physxnet_jax.simulation import (
-    ACCURACY,
+    PRESETS,
     Rollout,
     Scene,
     prepare_scene,
@@ -44,10 +44,10 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 
 def simulated(name: str, scene: Scene, motion: Motion) -> tuple[Rollout, float]:
     """A rollout and its milliseconds a frame, warm."""
-    if name in ENGINES:
-        rollout = ENGINES[name](scene, motion)
+    if name in EXTERNAL_ENGINES:
+        rollout = EXTERNAL_ENGINES[name](scene, motion)
         return rollout, float(np.median(rollout.diagnostics["milliseconds"]))
-    prepared, solver = prepare_scene(scene), ACCURACY[name]
+    prepared, solver = prepare_scene(scene), PRESETS[name]
     # Blocks of ten frames; the first one compiles.
     ticks: list[float] = []
     rollout = simulate_batch(
@@ -63,7 +63,9 @@ def rmse(one: np.ndarray, other: np.ndarray) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--engines", nargs="*", default=list(ENGINES), choices=list(ENGINES))
+    parser.add_argument(
+        "--engines", nargs="*", default=list(EXTERNAL_ENGINES), choices=list(EXTERNAL_ENGINES)
+    )
     parser.add_argument("--weights", default="small")
     parser.add_argument("--frames", type=int, default=60)
     parser.add_argument("--out", default=str(RESULTS / "engines.json"))
@@ -87,7 +89,7 @@ def main() -> None:
     truth = cloth["standard"]
     rows = [
         {
-            "method": name if name in ENGINES else f"simulator {name}",
+            "method": name if name in EXTERNAL_ENGINES else f"simulator {name}",
             "way": "a garment at a time",
             "ms_per_frame": sum(times[name]),
             "rmse_mm": statistics.fmean(rmse(cloth[name][t], truth[t]) for t in TEMPLATES),
@@ -95,12 +97,19 @@ def main() -> None:
         for name in names
     ]
     errors = {}
-    for push_out in (False, True):
+    for collisions in (False, True):
         worn = {
-            t: dress(motion, [t], weights=words.weights, push_out=push_out, include_body=False)
+            t: dress(
+                motion,
+                [t],
+                inference=Inference(
+                    weights=words.weights, strain_iterations=0, collisions=collisions
+                ),
+                include_body=False,
+            )
             for t in TEMPLATES
         }
-        errors["network+push" if push_out else "network"] = {
+        errors["network+push" if collisions else "network"] = {
             t: rmse(clip.garments[0].positions, truth[t]) for t, clip in worn.items()
         }
     predictor = load_predictor(words.weights)
@@ -130,9 +139,9 @@ def main() -> None:
         "rows": [{k: _short(v) for k, v in r.items()} for r in rows],
     }
     out = pathlib.Path(words.out)
-    with whole_file(out) as part:
+    with atomic_write(out) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
-    with whole_file(out.with_suffix(".md")) as part:
+    with atomic_write(out.with_suffix(".md")) as part:
         part.write_text("\n".join(lines) + "\n")
     bars.console.print(f"wrote {out} and .md")
 

@@ -27,9 +27,8 @@ import numpy as np
 from flax import nnx
 from rich.progress import Progress
 
-from physxnet_jax.files import whole_file
-from physxnet_jax.io import load_predictor
-from physxnet_jax.models import Predictor, fold_batch_norm
+from physxnet_jax.files import atomic_write
+from physxnet_jax.models import Predictor, fold_batch_norm, load_predictor
 
 HERE = pathlib.Path(__file__).parent
 
@@ -141,9 +140,9 @@ def main() -> None:
         for r in table
     ]
     out = pathlib.Path(words.out)
-    with whole_file(out) as part:
+    with atomic_write(out) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
-    with whole_file(out.with_suffix(".md")) as part:
+    with atomic_write(out.with_suffix(".md")) as part:
         part.write_text("\n".join(lines) + "\n")
     bars.console.print(f"largest difference {worst:.2g}; wrote {out} and .md")
 

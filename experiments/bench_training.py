@@ -26,20 +26,12 @@ import numpy as np
 from rich.progress import Progress
 
 from physxnet_jax.body import load_body
-from physxnet_jax.data import Sequence
-from physxnet_jax.files import whole_file
+from physxnet_jax.data import Frames, Sequence, batch_indices, load_frames, take
+from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import TEMPLATES, template
 from physxnet_jax.models import PAPER, ModelConfig, Normalisation, Up
 from physxnet_jax.motion import load_motion
-from physxnet_jax.training import (
-    Frames,
-    TrainConfig,
-    batch_indices,
-    load_frames,
-    make_step,
-    prepare_surface,
-    take,
-)
+from physxnet_jax.training import TrainConfig, make_problem, prepare_targets, train_step
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 
@@ -73,7 +65,8 @@ def walking_frames() -> Frames:
         {t: template(t) for t in TEMPLATES},
         body,
         body.rest_vertices(body.default_shape()),
-        PAPER,
+        window=PAPER.window,
+        local=False,
     )
 
 
@@ -88,7 +81,7 @@ def main() -> None:
     model = ModelConfig(PAPER, resolution=words.resolution, width=words.width)
     config = TrainConfig(model=model, batch=words.batch)
     frames = walking_frames()
-    atlas, surface, tables = prepare_surface(model)
+    atlas, surface, tables = prepare_targets(model)
     one = jnp.ones(())
     scales = Normalisation(one, one, {t: 0.01 * one for t in TEMPLATES})
     forms, laps, losses, cold = ("fast", "plain"), {}, {}, {}
@@ -100,21 +93,23 @@ def main() -> None:
             # Traced while the layer is what the form says.
             way = plain_transposed if form == "plain" else Up.__call__
             with mock.patch.object(Up, "__call__", way):
-                run = make_step(config, atlas, surface, scales, tables, frames.fps, 100)
+                problem, first = make_problem(
+                    config, atlas, surface, scales, tables, fps=frames.fps, steps=100
+                )
                 began = time.perf_counter()
                 state, metrics = jax.block_until_ready(
-                    run.step(run.first, batch, jax.random.key(0))
+                    train_step(problem, first, batch, jax.random.key(0))
                 )
                 cold[form] = time.perf_counter() - began
-            runs[form], losses[form], laps[form] = (run, state), float(metrics["l1"]), []
+            runs[form], losses[form], laps[form] = (problem, state), float(metrics["l1"]), []
             bars.update(bar, advance=1)
         prepared = []
         for k in range(words.rounds):
             batch, host = batch_of(frames, config, k + 1)
             prepared.append(host)
-            for form, (run, state) in runs.items():
+            for form, (problem, state) in runs.items():
                 began = time.perf_counter()
-                jax.block_until_ready(run.step(state, batch, jax.random.key(k)))
+                jax.block_until_ready(train_step(problem, state, batch, jax.random.key(k)))
                 laps[form].append(time.perf_counter() - began)
                 bars.update(bar, advance=1)
     rows = [
@@ -146,9 +141,9 @@ def main() -> None:
         for r in rows
     ]
     out = pathlib.Path(words.out)
-    with whole_file(out) as part:
+    with atomic_write(out) as part:
         part.write_text(json.dumps(data, indent=1) + "\n")
-    with whole_file(out.with_suffix(".md")) as part:
+    with atomic_write(out.with_suffix(".md")) as part:
         part.write_text("\n".join(lines) + "\n")
     bars.console.print(
         f"{data['times_faster']:.1f} times faster; a batch takes"

@@ -1,4 +1,3 @@
-# ruff: noqa: E501
 """What is said of broken files: a corpus, every reader, every message.
 
 Command: python experiments/broken_files.py
@@ -6,6 +5,7 @@ Cost:    half a minute.
 Result:  experiments/results/broken_files.md, shown in docs/broken-files.md.
 """
 
+# ruff: noqa: E501
 import io
 import json
 import pathlib
@@ -15,17 +15,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from physxnet_jax.dressing import load_scene
+from physxnet_jax.dressing import load_scene, read_character
 from physxnet_jax.errors import PhysXNetError
-from physxnet_jax.files import whole_file
-from physxnet_jax.io import (
-    load_predictor,
-    read_character,
-    read_mdd,
-    read_mesh,
-    read_obj,
-    read_pc2,
-)
+from physxnet_jax.files import atomic_write
+from physxnet_jax.io import read_mdd, read_mesh, read_obj, read_pc2
+from physxnet_jax.models import load_predictor
 from physxnet_jax.motion import load_motion, read_joint_map
 
 RESULT = pathlib.Path(__file__).parent / "results/broken_files.md"
@@ -167,13 +161,13 @@ def table() -> str:
 
 def main() -> None:
     text = table()
-    with whole_file(RESULT) as part:
+    with atomic_write(RESULT) as part:
         part.write_text(text)
     page = RESULT.parents[2] / "docs/broken-files.md"
     head, _, rest = page.read_text().partition("<!-- begin broken_files -->\n")
     tail = rest.partition("<!-- end broken_files -->")[2]
     marks = ("<!-- begin broken_files -->\n", "<!-- end broken_files -->")
-    with whole_file(page) as part:
+    with atomic_write(page) as part:
         part.write_text(head + marks[0] + text + marks[1] + tail)
 
 

@@ -24,7 +24,7 @@ OUT = pathlib.Path("src/physxnet_jax/body/assets/makehuman_cc0.npz")
 NUM_VERTICES = 19158
 NUM_BODY = 13380
 # Lengths are stored as whole numbers of this many metres, the precision of the source.
-QUANTUM = 1e-5
+QUANTIZATION_STEP = 1e-5
 # The macro height targets are extreme (1.24 m and 2.33 m); this share is the limit.
 HEIGHT_LIMIT = 0.2
 DELTAS = {
@@ -133,7 +133,7 @@ def build(wheel: pathlib.Path) -> dict[str, np.ndarray]:
     quantised = np.round(kept * 65535).astype(np.uint16)
 
     def lengths(x: np.ndarray, dtype: type) -> np.ndarray:
-        whole = np.round(x / 10.0 / QUANTUM)
+        whole = np.round(x / 10.0 / QUANTIZATION_STEP)
         assert np.abs(whole).max() < np.iinfo(dtype).max
         return whole.astype(dtype)
 
@@ -151,7 +151,7 @@ def build(wheel: pathlib.Path) -> dict[str, np.ndarray]:
     remap = np.full(len(uv), -1)
     remap[uv_used] = np.arange(len(uv_used))
     out: dict[str, np.ndarray] = {
-        "quantum": np.asarray(QUANTUM),
+        "quantum": np.asarray(QUANTIZATION_STEP),
         "bases": np.stack([lengths(b, np.int32) for b in bases]),
         "deltas": np.stack([[lengths(d, np.int16) for d in ds] for ds in deltas]),
         "delta_names": np.asarray(list(DELTAS)),

@@ -21,9 +21,9 @@ from rich.progress import track
 
 from physxnet_jax.data import load_action, read_protocol
 from physxnet_jax.evaluation import edge_strain, penetration
-from physxnet_jax.files import whole_file
+from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import TEMPLATES, template
-from physxnet_jax.simulation import ACCURACY, Scene, Status, prepare_scene, simulate_batch
+from physxnet_jax.simulation import PRESETS, Scene, Status, prepare_scene, simulate_batch
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 
@@ -31,7 +31,7 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 def one(name: str, action, folder: pathlib.Path, accuracy: str) -> dict:
     scene = prepare_scene(Scene((template(name),)))
     motion = load_action(folder / "mocap", action)
-    out = simulate_batch(scene, [motion], solver=ACCURACY[accuracy])[0]
+    out = simulate_batch(scene, [motion], solver=PRESETS[accuracy])[0]
     x = out.positions[0]
     seen = penetration(scene.assembly, motion, x)
     strain = edge_strain(scene.assembly, x)
@@ -57,7 +57,7 @@ def one(name: str, action, folder: pathlib.Path, accuracy: str) -> dict:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", default=os.environ.get("PHYSXNET_DATA", "../shared"))
-    parser.add_argument("--accuracy", default="standard", choices=tuple(ACCURACY))
+    parser.add_argument("--accuracy", default="standard", choices=tuple(PRESETS))
     words = parser.parse_args()
     folder = pathlib.Path(words.data)
     path = RESULTS / "penetration.json"
@@ -70,7 +70,7 @@ def main() -> None:
             # Each garment has programs of its own; kept, they would fill the memory.
             jax.clear_caches()
         rows.append(one(name, action, folder, words.accuracy))
-        with whole_file(path) as part:
+        with atomic_write(path) as part:
             part.write_text(json.dumps({"accuracy": words.accuracy, "rows": rows}, indent=1) + "\n")
     lines = [
         "| template | frames | inside | pinched | avoidable | deepest mm (avoidable) |"
@@ -91,7 +91,7 @@ def main() -> None:
             f" ({max(r['deepest_avoidable_mm'] for r in mine):.1f}) |"
             f" {100 * mean('skin_outside_share'):.3f} % | {mean('strain_p99'):.3f} |"
         )
-    with whole_file(path.with_suffix(".md")) as part:
+    with atomic_write(path.with_suffix(".md")) as part:
         part.write_text("\n".join(lines) + "\n")
 
 

@@ -33,7 +33,7 @@ def main() -> None:
         jnp.asarray(x[FRAME + 1 - seen.window : FRAME + 1])
         for x in clip_transforms(body, rest, motion)
     )
-    surface = predictor.surface
+    surface = predictor.texel_points
     features = clip_features(surface.rest, surface.weights, world, shift, 30.0, seen)
     inputs = np.asarray(features)[0]
     outputs = predictor(world, shift, 30.0, predictor.config.templates)

@@ -17,8 +17,8 @@ import time
 import imageio.v3 as iio
 import numpy as np
 
-from physxnet_jax.dressing import dress, load_character
-from physxnet_jax.files import whole_file
+from physxnet_jax.dressing import Inference, dress, load_character
+from physxnet_jax.files import atomic_write
 from physxnet_jax.viewer import render_frame
 
 RESULT = pathlib.Path(__file__).parent / "results/foreign_character.md"
@@ -49,7 +49,7 @@ def main() -> None:
     ]
     pictures = []
     for outfit in OUTFITS:
-        raw = dress(person, outfit, push_out=False)
+        raw = dress(person, outfit, inference=Inference(collisions=False))
         clip = dress(person, outfit)
         for a, b in zip(raw.garments, clip.garments, strict=True):
             moved = np.linalg.norm(a.positions - b.positions, axis=2).max()
@@ -58,10 +58,10 @@ def main() -> None:
                 f" | {1e3 * moved:.0f} |"
             )
         pictures += [render_frame(clip.meshes, k, size=(300, 400)) for k in MOMENTS]
-    with whole_file(RESULT) as part:
+    with atomic_write(RESULT) as part:
         part.write_text("\n".join(lines) + "\n")
     print("\n".join(lines))  # noqa: T201
-    with whole_file(PICTURE) as part:
+    with atomic_write(PICTURE) as part:
         iio.imwrite(part, np.concatenate(pictures, axis=1), extension=".png")
 
 

@@ -19,8 +19,8 @@ import time
 import imageio.v3 as iio
 import numpy as np
 
-from physxnet_jax.dressing import dress, load_character
-from physxnet_jax.files import whole_file
+from physxnet_jax.dressing import Inference, dress, load_character
+from physxnet_jax.files import atomic_write
 from physxnet_jax.viewer import render_frame
 
 PACKAGE = "@pmndrs/viverse@0.2.20"
@@ -49,7 +49,7 @@ def main() -> None:
             began = time.perf_counter()
             person = load_character(files["mannequin"], motion=motion, frames=int(30 * SECONDS))
             spent = time.perf_counter() - began
-            raw = dress(person, outfit, push_out=False)
+            raw = dress(person, outfit, inference=Inference(collisions=False))
             clip = dress(person, outfit)
             for g in clip.garments:
                 lines.append(
@@ -59,10 +59,10 @@ def main() -> None:
             for share in (0.1, 0.5, 0.9):
                 frame = int(share * clip.num_frames)
                 pictures.append(render_frame(clip.meshes, frame, size=(300, 400)))
-    with whole_file(RESULT) as part:
+    with atomic_write(RESULT) as part:
         part.write_text("\n".join(lines) + "\n")
     print("\n".join(lines))  # noqa: T201
-    with whole_file(PICTURE) as part:
+    with atomic_write(PICTURE) as part:
         iio.imwrite(part, np.concatenate(pictures, axis=1), extension=".png")
 
 

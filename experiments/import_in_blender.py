@@ -17,7 +17,7 @@ import tempfile
 import numpy as np
 
 from physxnet_jax.dressing import dress
-from physxnet_jax.files import whole_file
+from physxnet_jax.files import atomic_write
 from physxnet_jax.io import AnimatedMesh, write_clip
 
 HERE = pathlib.Path(__file__).parent
@@ -54,7 +54,7 @@ def main() -> None:
             x, y, z = mesh.positions[k].T
             gaps.append(np.abs(seen[f"{kind}_{k}"] - np.stack([x, -z, y], axis=1)).max())
         lines.append(f"| {told} | {max(gaps):.1e} | {len(mesh.positions[0]):,} |")
-    with whole_file(words.out) as part:
+    with atomic_write(words.out) as part:
         part.write_text("\n".join(lines) + "\n")
     print("\n".join(lines))  # noqa: T201
 

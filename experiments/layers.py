@@ -5,7 +5,7 @@ Command: python experiments/layers.py
 Cost:    about four minutes on two cores.
 Result:  experiments/results/layers.md, shown in docs/garments.md: on 32 frames of the punch the
          share of the outer garment's vertices beneath the inner one, and of the inner one's
-         above the outer one, with each pushed out of the body alone and with the layers kept
+         above the outer one, with collisions with the body alone resolved and with the layers kept
          apart; how much of the latter is in its own place: where both were within 3 cm of each
          other at rest. The remainder is another limb's cloth. Milliseconds a frame of both, in
          turns.
@@ -24,8 +24,8 @@ import numpy as np
 from jaxtyping import Float
 from rich.progress import track
 
-from physxnet_jax.dressing import Dresser, clothe, make_dresser
-from physxnet_jax.files import whole_file
+from physxnet_jax.dressing import Dresser, Inference, clothe, make_dresser
+from physxnet_jax.files import atomic_write
 from physxnet_jax.geometry import closest_points, make_mesh, vertex_normals
 from physxnet_jax.motion import load_motion
 
@@ -82,7 +82,7 @@ def main() -> None:
     for pair in track(PAIRS, description="pairs"):
         jax.clear_caches()
         worn = [folder / g if g.endswith(".obj") else g for g in pair]
-        kept = make_dresser(worn, weights=words.weights)
+        kept = make_dresser(worn, inference=Inference(weights=words.weights, strain_iterations=0))
         plain = Dresser(**{**vars(kept), "layers": ()})
         calls = [
             jax.jit(clothe, static_argnames="fps").lower(d, q, p, fps=30.0).compile()
@@ -101,9 +101,9 @@ def main() -> None:
         (before, _), (after, in_place) = shares
         cells = " | ".join(f"{100 * x:.2f}" for x in (*before, *after, *in_place))
         times = " | ".join(f"{statistics.median(x[1:]):.1f}" for x in laps)
-        names = " | ".join(w.name for w in kept.wearables)
+        names = " | ".join(w.name for w in kept.worn)
         lines.append(f"| {names} | {cells} | {times} |")
-    with whole_file(RESULT) as part:
+    with atomic_write(RESULT) as part:
         part.write_text("\n".join(lines) + "\n")
     print("\n".join(lines))  # noqa: T201
 
@@ -113,8 +113,8 @@ def measure(dresser: Dresser, cloth: dict[str, np.ndarray]) -> np.ndarray:
 
     In all, and where both were near each other at rest.
     """
-    worn = [cloth[w.name] for w in dresser.wearables]
-    rests = [np.asarray(w.rest) for w in dresser.wearables]
+    worn = [cloth[w.name] for w in dresser.worn]
+    rests = [np.asarray(w.rest) for w in dresser.worn]
     sides = []
     for still, moved, above in ((0, 1, False), (1, 0, True)):
         faces, lay = np.asarray(dresser.faces[still]), (rests[still], rests[moved])

@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from physxnet_jax.body import linear_blend_skinning, load_body
+from physxnet_jax.body import linear_blend_skinning, load_body, t_pose
 from physxnet_jax.dressing import DressedClip, dress, make_character
-from physxnet_jax.files import whole_file
+from physxnet_jax.files import atomic_write
 from physxnet_jax.geometry import closest_points, make_mesh
 from physxnet_jax.io import AnimatedMesh
 from physxnet_jax.motion import body_animation, load_motion
@@ -42,7 +42,7 @@ def stranger(
     """The same surface in 12,000 other triangles, and how it was bound."""
     body = load_body()
     rest = body.rest_vertices(shape)
-    world, shift = body.transforms(rest, body.t_pose(shape), jnp.asarray([0.0, 1.0, 0.0]))
+    world, shift = body.transforms(rest, t_pose(body, shape), jnp.asarray([0.0, 1.0, 0.0]))
     count = positions.shape[1]
     bind = np.asarray(linear_blend_skinning(rest[:count], body.weights[:count], world, shift))
     faces = np.array(body.rest_mesh().faces)
@@ -100,9 +100,9 @@ def main() -> None:
                         for m in meshes
                     ]
                     pictures.append(render_frame(meshes, 0, size=(260, 400)))
-    with whole_file(RESULT) as part:
+    with atomic_write(RESULT) as part:
         part.write_text("\n".join(lines) + "\n")
-    with whole_file(PICTURE) as part:
+    with atomic_write(PICTURE) as part:
         iio.imwrite(part, np.concatenate(pictures, axis=1), extension=".png")
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from physxnet_jax.viewer import Choice, Viewer
 
 DOCS = pathlib.Path(__file__).parents[1] / "docs"
-_TOLD = runpy.run_path(str(DOCS.parent / "tests/browser.py"))
+_SCENE_FILE_KEYS = runpy.run_path(str(DOCS.parent / "tests/browser.py"))
 # The browser's warning that it draws without a GPU says nothing of the viewer.
 _CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
 
@@ -28,7 +28,7 @@ def main() -> None:
     viewer.wait()
     viewer._playing.value = False
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        page = _TOLD["Page"](viewer.url, folder, (1280, 800))
+        page = _SCENE_FILE_KEYS["Page"](viewer.url, folder, (1280, 800))
         page.until("document.querySelector('canvas') !== null")
         time.sleep(8)
 

@@ -26,10 +26,10 @@ import optax
 from jaxtyping import Array, Float
 from rich.progress import Progress
 
-from physxnet_jax.dressing import Dresser, clothe, dress, make_dresser
-from physxnet_jax.files import whole_file
+from physxnet_jax.dressing import Dresser, Inference, clothe, dress, make_dresser
+from physxnet_jax.files import atomic_write
+from physxnet_jax.garment import skin_garment
 from physxnet_jax.geometry import quaternion_from_axis_angle, quaternion_multiply
-from physxnet_jax.models import skin_wearable
 from physxnet_jax.motion import Motion, load_motion
 
 RESULTS = pathlib.Path(__file__).parent / "results"
@@ -72,17 +72,17 @@ def recover(
         squares = [jnp.mean(jnp.sum((cloth[n] - x) ** 2, axis=2)) for n, x in target.items()]
         return functools.reduce(jnp.add, squares) / len(squares)
 
-    optimiser = optax.adam(optax.cosine_decay_schedule(rate, steps))
+    optimizer = optax.adam(optax.cosine_decay_schedule(rate, steps))
 
     @jax.jit
     def step(change: tuple[Array, Array], state: optax.OptState) -> tuple:
         value, grads = jax.value_and_grad(loss)(change)
         with jax.numpy_dtype_promotion("standard"):
-            updates, state = optimiser.update(grads, state)
+            updates, state = optimizer.update(grads, state)
         return optax.apply_updates(change, updates), state, value
 
     change = (jnp.zeros((*rotations.shape[:2], 3)), jnp.zeros_like(root))
-    state = optimiser.init(change)
+    state = optimizer.init(change)
     for k in range(steps):
         change, state, value = step(change, state)
         if report is not None:
@@ -102,8 +102,7 @@ def skinning_layer(dresser: Dresser) -> Layer:
         transforms = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))
         world, shift = transforms(rotations, root)
         return {
-            w.name: jax.vmap(functools.partial(skin_wearable, w))(world, shift)
-            for w in dresser.wearables
+            w.name: jax.vmap(functools.partial(skin_garment, w))(world, shift) for w in dresser.worn
         }
 
     return layer
@@ -136,8 +135,16 @@ def main() -> None:
     words = parser.parse_args()
     clip = load_motion(words.motion, fps=30.0)
     motion = Motion(clip.rotations[: words.frames], clip.root[: words.frames], 30.0, clip.name)
-    dresser = make_dresser(words.wear, weights=words.weights, push_out=False)
-    worn = dress(motion, words.wear, method=words.target, weights=words.weights)
+    dresser = make_dresser(
+        words.wear,
+        inference=Inference(weights=words.weights, strain_iterations=0, collisions=False),
+    )
+    worn = dress(
+        motion,
+        words.wear,
+        method=words.target,
+        inference=Inference(weights=words.weights, strain_iterations=0),
+    )
     target = {g.name: jnp.asarray(g.positions) for g in worn.garments}
     true = (motion.rotations, motion.root)
     held = (jnp.broadcast_to(true[0][:1], true[0].shape), true[1])
@@ -158,7 +165,7 @@ def main() -> None:
             found = recover(layer, target, *held, steps=words.steps, report=show)
             row[f"joints_mm_{name}"] = round(1e3 * joint_error(dresser, found, true), 2)
             row[f"cloth_mm_{name}"] = round(1e3 * last[0], 2)
-    with whole_file(pathlib.Path(words.out)) as part:
+    with atomic_write(pathlib.Path(words.out)) as part:
         part.write_text(json.dumps(row, indent=1) + "\n")
     bars.console.print_json(json.dumps(row))
 

@@ -1,7 +1,7 @@
 """The paper's experiment: every number and figure of docs/reproduction.md.
 
 Command: python experiments/reproduce.py --data runs/ours
-         --data runs/blender --learn-from runs/blender --methods lbs nearest mlp runs/blender-22
+         --data runs/blender --train-data runs/blender --methods lbs nearest mlp runs/blender-22
          runs/blender-22+push runs/local-22 nano small local local+push pair+mirror paper
          paper+push runs/paper-blender draft standard (if it is built)
 Cost:    about 40 minutes on two cores for all methods (penetration and the simulator take most
@@ -13,7 +13,7 @@ Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.pn
          net`; and
          the measured table in the cards of the packaged weights. Datasets are built by
          `physxnet dataset build`, weights trained by `physxnet train`, both from
-         experiments/configs.
+         experiments/training.toml.
 """
 
 import argparse
@@ -23,16 +23,22 @@ import re
 import statistics
 
 from physxnet_jax.cli import main as physxnet
-from physxnet_jax.data import CARD, dataset_digest, list_sequences, read_log, read_sequence
-from physxnet_jax.evaluation import ActionError, error_tables, means, summary_table
-from physxnet_jax.files import whole_file
+from physxnet_jax.data import (
+    CARD,
+    dataset_digest,
+    is_trainable,
+    list_sequences,
+    read_log,
+    read_sequence,
+)
+from physxnet_jax.evaluation import MIRROR, ActionError, error_tables, means, summary_table
+from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import TEMPLATES, template
-from physxnet_jax.io import MIRROR, save_mean
-from physxnet_jax.training import teaches
+from physxnet_jax.models import save_mean
 
 ROOT = pathlib.Path(__file__).parents[1]
 RESULTS = ROOT / "experiments/results"
-WEIGHTS = ROOT / "src/physxnet_jax/io/weights"
+WEIGHTS = ROOT / "src/physxnet_jax/models/weights"
 OUT = RESULTS / "test_errors.json"
 # A run that isn't shipped is named by its folder.
 METHODS = (
@@ -53,7 +59,7 @@ METHODS = (
     "paper",
     "paper+push",
     "draft",
-    "noise",
+    "perturbed",
 )
 # What README.md shows of them.
 SHORT = {
@@ -62,28 +68,28 @@ SHORT = {
     "mlp": "a perceptron of the pose",
     "local-22": "`local` from the 22 actions alone",
     "nano": "`nano`",
-    "nano+push": "`nano`, pushed out of the body",
+    "nano+push": "`nano`, collisions resolved",
     "small": "`small`",
-    "small+push": "`small`, pushed out",
+    "small+push": "`small`, collisions resolved",
     "local": "`local`",
     "local+relax": "`local+relax`",
-    "local+relax+push": "`local+relax`, pushed out (the default)",
+    "local+relax+push": "`local+relax`, collisions resolved (the default)",
     "pair+mirror": "`pair+mirror`",
-    "pair+mirror+push": "`pair+mirror`, pushed out",
+    "pair+mirror+push": "`pair+mirror`, collisions resolved",
     "paper": "the paper's network, at reduced size",
     "draft": "the simulator at `draft`",
-    "noise": "the simulation again, moved by 1e-6 m",
+    "perturbed": "the simulation again, moved by 1e-6 m",
 }
 # What docs/reproduction.md shows action by action; all of it is in test_errors.md.
 EACH_ACTION = (
     *("lbs", "nearest", "mlp", "local-22", "blender-22", "blender-22+push", "nano", "small"),
     *("local", "local+relax+push", "pair+mirror", "pair+mirror+relax+push"),
-    *("paper", "paper+push", "paper-blender", "draft", "standard", "noise"),
+    *("paper", "paper+push", "paper-blender", "draft", "standard", "perturbed"),
 )
 # Whose errors are told over those of skinning.
 SHARES = (
     *("local", "local-muon", "local+mirror", "pair", "pair+mirror", "pair+mirror+push"),
-    *("pair+mirror+relax+push", "noise"),
+    *("pair+mirror+relax+push", "perturbed"),
 )
 OURS = "physxnet"
 NETWORKS = (
@@ -114,16 +120,16 @@ ABRUPT = ("strong gesture", "jump", "punch")
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", action="append", default=[], help="datasets; none: tables alone")
-    parser.add_argument("--learn-from", default="runs/ours", help="of nearest and mlp")
+    parser.add_argument("--train-data", default="runs/ours", help="of nearest and mlp")
     parser.add_argument("--methods", nargs="+", default=METHODS)
     words = parser.parse_args()
     for data in words.data:
-        where = ["--data", data, "--learn-from", words.learn_from, "--out", str(OUT)]
+        where = ["--data", data, "--train-data", words.train_data, "--out", str(OUT)]
         code = physxnet(["evaluate", *words.methods, *where])
         if code:
             raise SystemExit(code)
     rows = [ActionError(**r) for r in json.loads(OUT.read_text())]
-    note_datasets(pathlib.Path(words.learn_from).parent)
+    note_datasets(pathlib.Path(words.train_data).parent)
     few = [r for r in rows if r.method in EACH_ACTION]
     blocks = {"summary": summary_table(rows), "errors": error_tables(few), "claims": claims(rows)}
     blocks["short"] = short_table(rows)
@@ -169,7 +175,7 @@ def main() -> None:
         for name, block in blocks.items():
             mark = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.S)
             text = mark.sub(lambda m, b=block: f"{m[1]}{b.strip()}\n{m[2]}", text)
-        with whole_file(path) as part:
+        with atomic_write(path) as part:
             part.write_text(text)
     save_mean(WEIGHTS / "pair", ("local", "local-muon"), card=CARD)
     for name in NETWORKS:
@@ -229,20 +235,20 @@ def write_ladder(rows: list[ActionError]) -> None:
     """The errors by which `physxnet dress --budget-ms` chooses."""
     # The teacher itself is as far from itself as two of its runs part.
     shipped = [m for m in METHODS if m.startswith(("nano", "small", "local", "pair"))]
-    names = {n: n for n in ("lbs", *shipped, "draft")} | {"noise": "standard"}
-    rungs = []
+    names = {n: n for n in ("lbs", *shipped, "draft")} | {"perturbed": "standard"}
+    profiles = []
     for method, name in names.items():
         found = {t: m for t in TEMPLATES if (m := means(rows, method, t, "physxnet"))}
         if len(found) == len(TEMPLATES):
-            rungs.append(
+            profiles.append(
                 {
                     "name": name,
                     "rmse_mm": {t: round(m["rmse_vertices_mm"], 2) for t, m in found.items()},
                     "inside": {t: round(m["penetration_share"], 5) for t, m in found.items()},
                 }
             )
-    with whole_file(ROOT / "src/physxnet_jax/dressing/ladder.json") as part:
-        part.write_text(json.dumps(rungs, indent=1) + "\n")
+    with atomic_write(ROOT / "src/physxnet_jax/evaluation/cost_table.json") as part:
+        part.write_text(json.dumps(profiles, indent=1) + "\n")
 
 
 def note_datasets(folder: pathlib.Path) -> None:
@@ -264,12 +270,12 @@ def note_datasets(folder: pathlib.Path) -> None:
             "actions": len(sequences),
             "frames": sum(s.motion.num_frames for s in sequences),
             "garments": sum(len(s.offsets) for s in sequences),
-            "came_off": sum(not teaches(s, t) for s in sequences for t in s.offsets),
+            "came_off": sum(not is_trainable(s, t) for s in sequences for t in s.offsets),
             "megabytes": round(size / 1e6, 1),
             "seconds": round(sum(x["seconds"] for x in log)) if log else None,
             "sha256": digest,
         }
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_text(json.dumps(known, indent=1) + "\n")
 
 
@@ -305,19 +311,19 @@ def note_measured(name: str, rows: list[ActionError]) -> None:
         for t in TEMPLATES
         if (found := means(rows, name, t, engine)) and (plain := means(rows, "lbs", t, engine))
     ]
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_text(json.dumps(card, indent=1))
 
 
 def shares_table(rows: list[ActionError]) -> str:
     """Errors over skinning's: all cells, and those in which the simulation agrees with itself.
 
-    The latter: its runs from starts 1e-6 m apart (`noise`) differ by less than half of what
+    The latter: its runs from starts 1e-6 m apart (`perturbed`) differ by less than half of what
     skinning is off.
     """
     of = {(r.method, r.template, r.action): r.rmse_vertices_mm for r in rows if r.engine == OURS}
     every = [(t, a) for t in TEMPLATES for a in sorted({a for _, _, a in of})]
-    agreed = [c for c in every if of["noise", *c] < 0.5 * of["lbs", *c]]
+    agreed = [c for c in every if of["perturbed", *c] < 0.5 * of["lbs", *c]]
     few = f"top, {len(agreed)} of {len(every)} cells"
     lines = [
         f"| method | {' | '.join(TEMPLATES)} | {few} | bottom | dress |",
@@ -335,7 +341,7 @@ def shares_table(rows: list[ActionError]) -> str:
 
 
 def more_motion(rows: list[ActionError]) -> str:
-    """One recipe with more motion, another optimiser, networks as teachers, and two's mean."""
+    """One recipe with more motion, another optimizer, networks as teachers, and two's mean."""
     lines = ["| asked | top, mm | bottom, mm | dress, mm |", "|---|---|---|---|"]
     networks = ("local", "local-wide", "local-muon", "local-taught", "pair")
     for name in (f"{n}{mirror}" for mirror in ("", MIRROR) for n in networks):
@@ -459,7 +465,7 @@ def sizes_table() -> str:
     # As the paper's 3D models: positions and triangles in four bytes a number.
     size = 4e-6 * (mesh.vertices.size + mesh.faces.size)
     weights = f"{ours['weights_mb']:.1f} MB for all three garments"
-    here = f"{ours['ms_per_frame']:.1f} ms, {pushed['ms_per_frame']:.1f} pushed out"
+    here = f"{ours['ms_per_frame']:.1f} ms, {pushed['ms_per_frame']:.1f} with collisions resolved"
     return "\n".join(
         [
             "| | LBS (paper) | TailorNet (paper) | PhysXNet (paper) | `lbs` here | `local` here |",

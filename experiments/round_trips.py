@@ -21,7 +21,7 @@ from jaxtyping import Float
 from pxr import Usd, UsdGeom
 
 from physxnet_jax.dressing import dress
-from physxnet_jax.files import whole_file
+from physxnet_jax.files import atomic_write
 from physxnet_jax.io import AnimatedMesh, write_clip
 
 RESULTS = pathlib.Path(__file__).parent / "results/round_trips.md"
@@ -139,10 +139,10 @@ def table(meshes: list[AnimatedMesh]) -> str:
 def main() -> None:
     clip = dress("walk", ["top", "bottom"], method="lbs", frames=20)
     text = table(list(clip.meshes))
-    with whole_file(RESULTS) as part:
+    with atomic_write(RESULTS) as part:
         part.write_text(text)
     mark = re.compile(r"(<!-- begin round_trips -->\n).*?(<!-- end round_trips -->)", re.S)
-    with whole_file(PAGE) as part:
+    with atomic_write(PAGE) as part:
         part.write_text(mark.sub(lambda m: m[1] + text + m[2], PAGE.read_text()))
 
 

@@ -17,18 +17,10 @@ import jax
 import numpy as np
 from rich.progress import track
 
-from physxnet_jax.files import whole_file
+from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import square_sheet
-from physxnet_jax.simulation import (
-    XPBD,
-    Bend,
-    Gravity,
-    Pin,
-    Scene,
-    Stretch,
-    prepare_scene,
-    simulate_still,
-)
+from physxnet_jax.simulation import XPBD, Scene, prepare_scene, settle_on_static_body
+from physxnet_jax.simulation.effects import Bend, Gravity, Pin, Stretch
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 SIDES = (32, 45, 64, 90, 128)
@@ -51,7 +43,7 @@ def measure(side: int) -> Row:
 
     def run() -> tuple[float, float]:
         began = time.perf_counter()
-        out = simulate_still(scene, FRAMES, solver=XPBD(SUBSTEPS, 1))
+        out = settle_on_static_body(scene, FRAMES, solver=XPBD(SUBSTEPS, 1))
         out.check()
         lowest = float(out.positions[0][-1][:, 1].min())
         return time.perf_counter() - began, lowest
@@ -73,14 +65,14 @@ def main() -> None:
     for side in track(SIDES, description="sheets"):
         rows.append(measure(side))
         jax.clear_caches()
-    with whole_file(RESULTS / "sheet_scaling.json") as part:
+    with atomic_write(RESULTS / "sheet_scaling.json") as part:
         part.write_text(json.dumps([dataclasses.asdict(r) for r in rows], indent=1) + "\n")
     lines = ["| vertices | ms/frame | ns a vertex and substep | sag mm |", "|---|---|---|---|"]
     lines += [
         f"| {r.vertices} | {r.ms_per_frame:.1f} | {r.ns_per_vertex_substep:.0f} | {r.sag_mm:.1f} |"
         for r in rows
     ]
-    with whole_file(RESULTS / "sheet_scaling.md") as part:
+    with atomic_write(RESULTS / "sheet_scaling.md") as part:
         part.write_text("\n".join(lines) + "\n")
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from rich.progress import track
 
 from physxnet_jax.evaluation import DRAPE_BANDS, cantilever_test, drape_test
-from physxnet_jax.files import whole_file
+from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import FABRICS
 
 RESULTS = pathlib.Path(__file__).parent / "results"
@@ -42,7 +42,7 @@ def main() -> None:
                 **{f"cantilever_{k}": v for k, v in dataclasses.asdict(strip).items()},
             }
         )
-    with whole_file(RESULTS / "textile.json") as part:
+    with atomic_write(RESULTS / "textile.json") as part:
         part.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     lines = [
         "| fabric | drape % (10 mm mesh) | (7 mm) | published | folds | bending length mm |"
@@ -56,7 +56,7 @@ def main() -> None:
             f" {low:.0f} to {high:.0f} | {r['folds']} | {1e3 * r['cantilever_length']:.1f} |"
             f" {1e3 * r['cantilever_measured']:.1f} |"
         )
-    with whole_file(RESULTS / "textile.md") as part:
+    with atomic_write(RESULTS / "textile.md") as part:
         part.write_text("\n".join(lines) + "\n")
     draw(specimens)
 
@@ -78,7 +78,7 @@ def draw(specimens: dict) -> None:
     picture = np.asarray(plot.screenshot(return_img=True))
     from PIL import Image
 
-    with whole_file(RESULTS / "textile.png") as part:
+    with atomic_write(RESULTS / "textile.png") as part:
         Image.fromarray(picture).save(part, format="PNG")
 
 

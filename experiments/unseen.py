@@ -18,10 +18,10 @@ from rich.progress import track
 
 from physxnet_jax.body import load_body
 from physxnet_jax.data import load_action, read_protocol
-from physxnet_jax.dressing import dress
+from physxnet_jax.dressing import Inference, dress
 from physxnet_jax.evaluation import vertex_error
-from physxnet_jax.files import whole_file
-from physxnet_jax.io import load_garment
+from physxnet_jax.files import atomic_write
+from physxnet_jax.garment import load_garment
 from physxnet_jax.motion import Motion
 
 RESULTS = pathlib.Path(__file__).parent / "results"
@@ -65,10 +65,11 @@ def main() -> None:
                     motion,
                     [garment],
                     method=m,
-                    weights=words.weights,
+                    inference=Inference(
+                        weights=words.weights, strain_iterations=0, collisions=m == "network"
+                    ),
                     shape=figure,
                     include_body=False,
-                    push_out=m == "network",
                 )
                 for m in ("simulate", "network", "lbs")
             }
@@ -78,7 +79,7 @@ def main() -> None:
                 row[f"rmse_{m}_mm"] = vertex_error(cloth[m], cloth["simulate"]).rmse_mm
                 row[f"inside_{m}"] = next(iter(worn[m].inside.values()))
             rows.append(row)
-            with whole_file(path) as part:
+            with atomic_write(path) as part:
                 part.write_text(json.dumps(rows, indent=1) + "\n")
     lines = [
         "| what | garment | action | network, mm | lbs, mm | network / lbs | inside, % |",
@@ -90,7 +91,7 @@ def main() -> None:
             f"| {r['what']} | {r['garment']} | {r['action']} | {r['rmse_network_mm']:.1f} |"
             f" {r['rmse_lbs_mm']:.1f} | {ratio:.2f} | {100 * r['inside_network']:.2f} |"
         )
-    with whole_file(path.with_suffix(".md")) as part:
+    with atomic_write(path.with_suffix(".md")) as part:
         part.write_text("\n".join(lines) + "\n")
 
 

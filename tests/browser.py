@@ -38,10 +38,10 @@ class Page:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
         )
-        told = pathlib.Path(folder) / "DevToolsActivePort"
+        port_file = pathlib.Path(folder) / "DevToolsActivePort"
         for _ in range(300):
             with contextlib.suppress(OSError, IndexError):
-                port = told.read_text().split()[0]
+                port = port_file.read_text().split()[0]
                 with urllib.request.urlopen(f"http://127.0.0.1:{port}/json", timeout=5) as answer:
                     tabs = [t for t in json.load(answer) if t["type"] == "page"]
                 break

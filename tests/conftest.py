@@ -1,7 +1,11 @@
 """Shapes are checked by beartype; dtypes and ranks are never promoted silently."""
 
+import ctypes
+import gc
 import os
 import pathlib
+import resource
+import sys
 
 import hypothesis
 import jaxtyping
@@ -17,11 +21,11 @@ import jax  # noqa: E402
 
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-from physxnet_jax._environment import free_programs, programs_folder  # noqa: E402
+from physxnet_jax._environment import clear_caches_if_full, compilation_cache_folder  # noqa: E402
 
 # Many tests compile the same programs, in several processes, and every run does again:
 # once is enough on a machine.
-_CACHE = programs_folder("tests")
+_CACHE = compilation_cache_folder("tests")
 _MOST_BYTES = 1e9
 jax.config.update("jax_compilation_cache_dir", str(_CACHE))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
@@ -32,22 +36,64 @@ os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
 
 def pytest_configure(config):
     """Drops the oldest programs, in one process."""
+    config.pluginmanager.register(_Peaks(), "peaks")
     if hasattr(config, "workerinput") or not _CACHE.is_dir():
         return
-    told = {p: p.stat() for p in _CACHE.iterdir()}
-    size = sum(s.st_size for s in told.values())
-    for path in sorted(told, key=lambda p: told[p].st_mtime):
+    stats = {p: p.stat() for p in _CACHE.iterdir()}
+    size = sum(s.st_size for s in stats.values())
+    for path in sorted(stats, key=lambda p: stats[p].st_mtime):
         if size < _MOST_BYTES:
             break
         path.unlink(missing_ok=True)
-        size -= told[path].st_size
+        size -= stats[path].st_size
+
+
+# Two workers must fit a laptop; compiled programs are most of a worker's memory [bytes].
+_MOST_MEMORY = 0.9e9
+
+
+def _memory() -> float:
+    """Resident memory of this process [bytes]; 0 where the system doesn't report it."""
+    try:
+        pages = int(pathlib.Path("/proc/self/statm").read_text().split()[1])
+    except (OSError, ValueError):
+        return 0.0
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _free_compiled_code():
-    """Each compiled function holds memory maps, of which a process has 65,530."""
+    """Each compiled function holds memory, and maps of which a process has 65,530."""
     yield
-    free_programs(0.45)
+    if not clear_caches_if_full(0.45) and _memory() > _MOST_MEMORY:
+        jax.clear_caches()
+    gc.collect()
+    if sys.platform == "linux":
+        # The allocator keeps what is freed otherwise.
+        ctypes.CDLL("libc.so.6").malloc_trim(0)
+
+
+def pytest_sessionfinish(session):
+    """Each worker reports its peak memory."""
+    if hasattr(session.config, "workeroutput"):
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        session.config.workeroutput["peak_mb"] = peak / 1024
+
+
+class _Peaks:
+    """Peak memory of the workers, shown at the end."""
+
+    def __init__(self):
+        self.found = []
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_testnodedown(self, node):
+        self.found.append(getattr(node, "workeroutput", {}).get("peak_mb", 0.0))
+
+    def pytest_terminal_summary(self, terminalreporter):
+        if self.found:
+            peaks = ", ".join(f"{x:.0f}" for x in self.found)
+            terminalreporter.write_line(f"peak memory of the workers [MB]: {peaks}")
 
 
 @pytest.fixture(scope="session")

@@ -12,10 +12,11 @@ import pytest
 
 from physxnet_jax.data import open_dataset, read_log, read_sequence, write_action, write_garment
 from physxnet_jax.data._store import write_offsets
-from physxnet_jax.dressing import load_scene
+from physxnet_jax.dressing import load_scene, read_character
 from physxnet_jax.errors import FormatError, MotionError, PhysXNetError, WeightsError
 from physxnet_jax.garment import square_sheet
-from physxnet_jax.io import read_card, read_character, read_mesh, read_obj, weights_size
+from physxnet_jax.io import read_mesh, read_obj
+from physxnet_jax.models import read_card, weights_size
 from physxnet_jax.motion import (
     load_motion,
     make_motion,
@@ -29,7 +30,7 @@ bvh = _SAMPLES["standing_bvh"]
 _FUZZ = runpy.run_path(str(pathlib.Path(__file__).with_name("test_fuzz.py")))
 
 
-def test_the_figure_that_is_changed_below_is_good(tmp_path):
+def test_unmodified_reference_figure_is_read(tmp_path):
     (tmp_path / "a.bvh").write_text(bvh())
     assert load_motion(tmp_path / "a.bvh").num_frames == 2, "the T-pose is none"
     (tmp_path / "a.bvh").write_text(bvh(legs=-0.4))
@@ -41,36 +42,36 @@ def test_the_figure_that_is_changed_below_is_good(tmp_path):
     "where",
     ["root", "legs", "Spine", "LeftUpLeg", "LeftArm", "LeftHand"],
 )
-def test_joints_beyond_all_measure_are_refused(tmp_path, where, far):
+def test_joints_out_of_range_are_refused(tmp_path, where, far):
     changed = {"root": (far, far, far)} if where == "root" else {}
     changed |= {"legs": -far} if where == "legs" else {}
     if not changed:
         changed = {"offsets": {where: (far, far, far)}}
     (tmp_path / "a.bvh").write_text(bvh(**changed))
-    with pytest.raises(MotionError, match=r"units away|beyond any measure|length|legs"):
+    with pytest.raises(MotionError, match=r"units away|out of range|length|legs"):
         load_motion(tmp_path / "a.bvh")
 
 
 @pytest.mark.parametrize("length", [0, 1e-200, 1e-320])
-def test_legs_that_a_clip_shrinks_to_nothing_are_told_of(tmp_path, length):
+def test_legs_without_length_are_refused(tmp_path, length):
     (tmp_path / "a.bvh").write_text(bvh(legs=length))
     with pytest.raises(MotionError, match="legs"):
         load_motion(tmp_path / "a.bvh")
 
 
-def test_a_file_of_a_byte_order_mark_is_empty(tmp_path):
+def test_bvh_with_only_a_byte_order_mark_is_refused_as_empty(tmp_path):
     (tmp_path / "a.bvh").write_bytes(b"\xef\xbb\xbf\n")
     with pytest.raises(MotionError, match="empty"):
         read_bvh(tmp_path / "a.bvh")
 
 
-def test_bones_of_an_asf_have_lengths(tmp_path):
+def test_asf_bone_lengths_out_of_range_are_refused(tmp_path):
     asf, amc = _FUZZ["ASF"], _FUZZ["AMC"]
     (tmp_path / "a.amc").write_text(amc)
     (tmp_path / "a.asf").write_text(asf)
     read_amc(tmp_path / "a.amc", tmp_path / "a.asf")
     (tmp_path / "a.asf").write_text(asf.replace("length 2", "length 1e308"))
-    with pytest.raises(MotionError, match="beyond any measure"):
+    with pytest.raises(MotionError, match="out of range"):
         read_amc(tmp_path / "a.amc", tmp_path / "a.asf")
 
 
@@ -84,7 +85,7 @@ def test_bones_of_an_asf_have_lengths(tmp_path):
         {"matrix": [1e200, 0, 0, 0, 0, 1e200, 0, 0, 0, 0, 1e200, 0, 0, 0, 0, 1]},
     ],
 )
-def test_nodes_beyond_all_measure_are_refused(tmp_path, node):
+def test_gltf_node_transforms_out_of_range_are_refused(tmp_path, node):
     document = json.loads(_FUZZ["_gltf"](tmp_path))
     for n in (1, 2, 3):
         document["nodes"][n] = {**document["nodes"][n], **node}
@@ -95,24 +96,24 @@ def test_nodes_beyond_all_measure_are_refused(tmp_path, node):
         load_motion(tmp_path / "a.gltf")
 
 
-def test_scales_that_multiply_beyond_all_measure_are_refused(tmp_path):
+def test_accumulated_node_scales_out_of_range_are_refused(tmp_path):
     document = json.loads(_FUZZ["_gltf"](tmp_path))
     for node in document["nodes"]:
         node["scale"] = [1e8, 1e8, 1e8]
     (tmp_path / "a.gltf").write_text(json.dumps(document))
-    with pytest.raises(MotionError, match="nowhere near"):
+    with pytest.raises(MotionError, match="too far away"):
         load_motion(tmp_path / "a.gltf")
 
 
 @pytest.mark.parametrize("nodes", [None, [], 5])
-def test_a_gltf_without_nodes_is_refused(tmp_path, nodes):
+def test_gltf_without_nodes_is_refused(tmp_path, nodes):
     document = json.loads(_FUZZ["_gltf"](tmp_path)) | {"nodes": nodes}
     (tmp_path / "a.gltf").write_text(json.dumps(document))
     with pytest.raises(PhysXNetError):
         load_motion(tmp_path / "a.gltf")
 
 
-def test_a_joint_that_is_in_a_skin_twice_is_refused(tmp_path):
+def test_duplicate_joints_in_a_skin_are_refused(tmp_path):
     document = json.loads(_FUZZ["_skin"](tmp_path))
     (tmp_path / "a.gltf").write_text(json.dumps(document))
     read_mesh(tmp_path / "a.gltf")
@@ -135,7 +136,7 @@ POSES, TRANS = np.zeros((3, 66)), np.zeros((3, 3))
         {"root_orient": POSES[:, :3].astype("M8[s]"), "pose_body": POSES[:, 3:], "trans": TRANS},
     ],
 )
-def test_poses_that_are_none_are_refused(tmp_path, arrays):
+def test_invalid_amass_poses_are_refused(tmp_path, arrays):
     np.savez(tmp_path / "a.npz", mocap_framerate=30.0, poses=POSES, trans=TRANS)
     load_motion(tmp_path / "a.npz")
     np.savez(tmp_path / "a.npz", mocap_framerate=30.0, **arrays)
@@ -146,7 +147,7 @@ def test_poses_that_are_none_are_refused(tmp_path, arrays):
 TURNS = np.tile([1.0, 0.0, 0.0, 0.0], (2, 31, 1))
 
 
-def test_large_quaternions_are_rotations_too():
+def test_large_quaternions_are_normalized():
     motion = make_motion(1e200 * TURNS, np.zeros((2, 3)), 30.0)
     np.testing.assert_array_equal(motion.rotations, TURNS)
 
@@ -163,7 +164,7 @@ def test_large_quaternions_are_rotations_too():
         },
     ],
 )
-def test_archives_of_no_numbers_or_too_many_are_refused(tmp_path, arrays):
+def test_motion_archives_with_invalid_arrays_are_refused(tmp_path, arrays):
     good = {"rotations": TURNS, "root": np.zeros((2, 3)), "fps": 30.0}
     np.savez_compressed(tmp_path / "a.npz", **good | arrays)
     with pytest.raises(MotionError):
@@ -183,7 +184,7 @@ MOVING = np.stack([TRIANGLE, TRIANGLE + 0.1])
         (np.round(100 * MOVING).astype(np.uint8), 30.0),
     ],
 )
-def test_a_person_in_numbers_of_any_kind_is_read(tmp_path, positions, fps):
+def test_character_arrays_of_any_numeric_type_are_read(tmp_path, positions, fps):
     np.savez(tmp_path / "a.npz", positions=positions, faces=np.array([[0, 1, 2]]), fps=fps)
     person, _, _ = read_character(tmp_path / "a.npz", fps=60.0)
     assert 3 <= len(person.positions) <= 4
@@ -195,20 +196,20 @@ def test_a_person_in_numbers_of_any_kind_is_read(tmp_path, positions, fps):
     "arrays",
     [
         {"fps": 5e-324},
-        {"fps": np.timedelta64(30)},
+        {"fps": np.timedelta64(30, "s")},
         {"fps": np.array([30.0, 30.0])},
         {"positions": MOVING.astype("m8[s]")},
         {"positions": MOVING.astype(np.longdouble)},
     ],
 )
-def test_a_person_in_no_numbers_is_refused(tmp_path, arrays):
+def test_character_archives_with_invalid_arrays_are_refused(tmp_path, arrays):
     good = {"positions": MOVING, "faces": np.array([[0, 1, 2]]), "fps": 30.0}
     np.savez(tmp_path / "a.npz", **good | arrays)
     with pytest.raises(FormatError):
         read_character(tmp_path / "a.npz", frames=2)
 
 
-def test_names_that_no_system_has_name_nothing(tmp_path):
+def test_invalid_file_names_are_reported_as_missing(tmp_path):
     long = "a" * 300
     (tmp_path / "a.obj").write_text(f"mtllib {long}\n{_FUZZ['OBJ']}")
     assert len(read_obj(tmp_path / "a.obj").faces) == 4
@@ -222,7 +223,7 @@ def test_names_that_no_system_has_name_nothing(tmp_path):
         load_motion(tmp_path / "a.gltf")
 
 
-def test_what_is_named_often_is_read_once(tmp_path):
+def test_repeated_references_are_read_once(tmp_path):
     """Options, libraries and images that come again and again cost no square of them."""
     (tmp_path / "red.png").write_bytes(_FUZZ["_png"](tmp_path))
     options = "-a " * 20_000
@@ -236,7 +237,7 @@ def test_what_is_named_often_is_read_once(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["a = " + "[" * 5000, "a = " + "9" * 5000])
-def test_tables_that_python_can_not_hold_are_refused(tmp_path, text):
+def test_unparsable_toml_files_are_refused(tmp_path, text):
     (tmp_path / "a.toml").write_text(text)
     with pytest.raises(MotionError):
         read_joint_map(tmp_path / "a.toml")
@@ -255,14 +256,14 @@ def test_tables_that_python_can_not_hold_are_refused(tmp_path, text):
         f"[effects.{'x' * 5000}]",
     ],
 )
-def test_settings_that_are_none_are_refused(tmp_path, line):
+def test_invalid_scene_settings_are_refused(tmp_path, line):
     (tmp_path / "a.toml").write_text(f'motion = "walk"\n{line}\n')
     with pytest.raises(PhysXNetError) as told:
         load_scene(tmp_path / "a.toml")
     assert len(str(told.value)) < 1500
 
 
-def test_a_long_error_keeps_its_beginning_and_its_advice():
+def test_long_errors_keep_their_start_and_their_advice():
     text = str(MotionError.at("a.bvh", 3, "x" * 10_000, "Export it again"))
     assert text.startswith("a.bvh:3: xxx") and text.endswith("Export it again") and len(text) < 1300
 
@@ -293,7 +294,7 @@ def dataset(tmp_path):
         {"faces": np.full((2, 3), -1)},
     ],
 )
-def test_a_damaged_garment_of_a_dataset_is_told_of(dataset, change):
+def test_damaged_garment_of_a_dataset_is_reported(dataset, change):
     path = dataset / "garments/top.npz"
     with np.load(path) as told:
         np.savez(path, **{**told, **change})
@@ -304,7 +305,7 @@ def test_a_damaged_garment_of_a_dataset_is_told_of(dataset, change):
 @pytest.mark.parametrize(
     "shape", [[3, 9, 10_000_000], [3, 4, 60], [3, 9], [10_000, 10_000, 10_000]]
 )
-def test_an_array_that_announces_what_it_has_not_is_told_of(dataset, shape):
+def test_arrays_with_a_false_shape_are_reported(dataset, shape):
     path = dataset / "walk/top/zarr.json"
     told = json.loads(path.read_text())
     told["shape"] = shape
@@ -314,7 +315,7 @@ def test_an_array_that_announces_what_it_has_not_is_told_of(dataset, shape):
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "{}", "5", '{"attributes": 3}', "\xff"])
-def test_damaged_notes_are_told_of(dataset, text):
+def test_damaged_metadata_files_are_reported(dataset, text):
     for name in ("walk/top/zarr.json", "walk/action.json"):
         path = dataset / name
         before = path.read_bytes()
@@ -330,7 +331,7 @@ def test_damaged_notes_are_told_of(dataset, text):
             weights_size(dataset)
 
 
-def test_a_card_of_nothing_has_no_size(tmp_path):
+def test_weights_size_of_an_invalid_card_is_refused(tmp_path):
     (tmp_path / "card.json").write_text(json.dumps({"mean_of": 5}))
     assert read_card(tmp_path) == {"mean_of": 5}
     with pytest.raises(WeightsError, match="no such file"):
@@ -351,7 +352,7 @@ def test_a_card_of_nothing_has_no_size(tmp_path):
     ],
     ids=["nested", "brackets", "references"],
 )
-def test_stages_without_end_are_refused_before_they_are_read(tmp_path, text, monkeypatch):
+def test_oversized_usd_stages_are_refused_before_reading(tmp_path, text, monkeypatch):
     pytest.importorskip("pxr")
     monkeypatch.setattr("physxnet_jax.io._usd_trial._SECONDS", 5.0)
     (tmp_path / "a.usda").write_text(f"#usda 1.0\n{text}")

@@ -5,24 +5,28 @@ import pathlib
 import re
 import runpy
 import shlex
+import tomllib
 
 import pytest
 
 from physxnet_jax.cli import parse
+from physxnet_jax.cli._configs import read_config
 from physxnet_jax.data import DatasetConfig, read_protocol
 from physxnet_jax.dressing import dress, load_scene
 from physxnet_jax.evaluation import CASES, ActionError, error_tables, means, summary_table
 from physxnet_jax.garment import FABRICS, TEMPLATES
-from physxnet_jax.io import list_weights, read_card
+from physxnet_jax.models import list_weights, read_card
 from physxnet_jax.motion import read_joint_map
-from physxnet_jax.simulation import EFFECTS, Air
+from physxnet_jax.simulation import EFFECTS
+from physxnet_jax.simulation.effects import Air
 from physxnet_jax.training import TrainConfig
 
 ROOT = pathlib.Path(__file__).parents[1]
 TEXT = (ROOT / "docs/simulation.md").read_text()
 
 
-def test_the_code_runs_and_the_scene_file_loads(tmp_path):
+@pytest.mark.release
+def test_simulation_page_code_runs_and_its_scene_file_loads(tmp_path):
     there = {}
     exec(re.search(r"```python\n(.*?)```", TEXT, re.S).group(1), there)
     assert any(isinstance(e, Air) for e in there["scene"].effects)
@@ -34,16 +38,16 @@ def test_the_code_runs_and_the_scene_file_loads(tmp_path):
 
 
 @pytest.mark.parametrize("name", [p.name for p in ROOT.glob("docs/*.md")] + ["README.md"])
-def test_every_command_is_understood(name, monkeypatch):
+def test_every_documented_command_parses(name, monkeypatch):
     """Each line that begins with the command's name means something to it."""
     path = ROOT / name if name == "README.md" else ROOT / "docs" / name
     text = path.read_text()
-    lines = re.findall(r"^(?:\.venv/bin/)?physxnet (.*?)(?: *#.*)?$", text, re.M)
+    lines = re.findall(r"^(?:\.venv/bin/)?physxnet (.*?)(?: +#.*)?$", text, re.M)
     for line in lines:
         parse(shlex.split(line))
 
 
-def test_each_pain_has_a_command_that_is_one():
+def test_each_row_of_the_pains_page_has_a_valid_command():
     rows = (ROOT / "docs/pains.md").read_text().partition("|---|---|---|\n")[2].splitlines()
     assert len(rows) == 15
     for row in rows:
@@ -52,13 +56,13 @@ def test_each_pain_has_a_command_that_is_one():
         parse(shlex.split(command.strip("`"))[1:])
 
 
-def test_every_link_leads_somewhere():
+def test_every_relative_link_exists():
     for path in [ROOT / "README.md", *ROOT.glob("docs/*.md")]:
         for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", path.read_text()):
             assert (path.parent / link).exists(), f"{path.name}: {link}"
 
 
-def test_the_joint_map_that_is_shown_is_one(tmp_path):
+def test_documented_joint_map_is_valid(tmp_path):
     text = (ROOT / "docs/motion.md").read_text()
     path = tmp_path / "names.toml"
     path.write_text(re.search(r"```toml\n(.*?)```", text, re.S).group(1))
@@ -66,7 +70,7 @@ def test_the_joint_map_that_is_shown_is_one(tmp_path):
     assert len(joints) == 13 and all(f"`{b}`" in text or f"{b} =" in text for b in joints)
 
 
-def test_the_protocol_is_the_one_that_was_measured(data_dir):
+def test_protocol_page_matches_the_measured_protocol(data_dir):
     text = (ROOT / "docs/protocol.md").read_text()
     rows = [[c.strip() for c in r.split("|")[1:-1]] for r in text.splitlines() if "| " in r]
     told = [
@@ -83,7 +87,7 @@ def test_every_effect_is_listed():
     assert all(f"`{name}`" in TEXT for name in EFFECTS)
 
 
-def test_the_tables_are_the_measured_ones():
+def test_simulation_page_tables_match_the_measurements():
     measured = (ROOT / "experiments/results/sim_bench.md").read_text()
     solvers = ("| xpbd", "| bdf2", "| backward", "| verlet", "| blender", "| newton")
     rows = [r for r in TEXT.splitlines() if r.startswith(solvers)]
@@ -96,7 +100,7 @@ def test_the_tables_are_the_measured_ones():
     assert len(rows) == len(FABRICS) and all(r in textile for r in rows)
 
 
-def test_costs_are_the_measured_ones():
+def test_cost_tables_match_the_measurements():
     text = (ROOT / "docs/accuracy-cost.md").read_text()
     own = (ROOT / "docs/own-body.md").read_text()
     assert (ROOT / "experiments/results/own_bodies.md").read_text() in own
@@ -121,7 +125,7 @@ def test_costs_are_the_measured_ones():
     assert {n.partition("+")[0] for n in named} <= set(list_weights())
 
 
-def test_round_trips_are_as_near_as_is_told():
+def test_round_trip_errors_match_the_documented_table():
     """Written and read back here, with fewer frames; the table is the measured one."""
     told = (ROOT / "experiments/results/round_trips.md").read_text()
     assert told in (ROOT / "docs/garments.md").read_text()
@@ -132,7 +136,7 @@ def test_round_trips_are_as_near_as_is_told():
         assert len(far) == len(made["FORMATS"]) and max(far) < 1e-5
 
 
-def test_blender_saw_what_is_told():
+def test_blender_import_table_matches_the_measurements():
     text = (ROOT / "docs/garments.md").read_text()
     block = re.search(
         r"<!-- begin blender_import -->\n(.*?)<!-- end blender_import -->", text, re.S
@@ -142,7 +146,7 @@ def test_blender_saw_what_is_told():
     assert all(float(x) < 1e-5 for x in re.findall(r"\| (\d\.\de-\d+) \|", measured))
 
 
-def test_hard_cases_are_told_as_measured():
+def test_hard_case_table_matches_the_measurements():
     text = (ROOT / "docs/stability.md").read_text()
     table = runpy.run_path(str(ROOT / "experiments/reproduce.py"))["stress_table"]()
     assert f"<!-- begin stress -->\n{table}\n<!-- end stress -->" in text
@@ -153,7 +157,7 @@ def test_hard_cases_are_told_as_measured():
         assert (ROOT / path).is_file(), path
 
 
-def test_layers_are_told_as_measured():
+def test_layer_table_matches_the_measurements():
     measured = (ROOT / "experiments/results/layers.md").read_text()
     assert measured in (ROOT / "docs/garments.md").read_text()
     for row in measured.splitlines()[2:]:
@@ -163,7 +167,7 @@ def test_layers_are_told_as_measured():
         assert max(kept) < 4.0 and own_outer < 1.0 and own_inner < 0.5
 
 
-def test_broken_files_are_refused_as_is_told():
+def test_broken_file_table_matches_the_program():
     made = runpy.run_path(str(ROOT / "experiments/broken_files.py"))["table"]()
     assert made == (ROOT / "experiments/results/broken_files.md").read_text()
     assert made in (ROOT / "docs/broken-files.md").read_text()
@@ -173,7 +177,7 @@ def test_broken_files_are_refused_as_is_told():
 @pytest.mark.parametrize(
     ("page", "script"), [("reproduction", "everything"), ("accuracy-cost", "accuracy_cost")]
 )
-def test_one_script_is_every_command_of_a_page(page, script):
+def test_script_contains_every_command_of_its_page(page, script):
     text = (ROOT / f"docs/{page}.md").read_text()
     block = re.findall(r"```\n(physxnet .*?)```", text, re.S)[0]
     script = (ROOT / f"experiments/{script}.sh").read_text()
@@ -182,7 +186,7 @@ def test_one_script_is_every_command_of_a_page(page, script):
         assert (ROOT / name).is_file()
 
 
-def test_the_reproduction_shows_what_was_measured():
+def test_reproduction_page_matches_the_measurements():
     """Tables and claims are made of the rows, and the shipped cards say the same."""
     text = (ROOT / "docs/reproduction.md").read_text()
     told = json.loads((ROOT / "experiments/results/test_errors.json").read_text())
@@ -209,13 +213,12 @@ def test_the_reproduction_shows_what_was_measured():
     for name, table in (("more_motion", made["more_motion"]), ("paper_longer", summary_table)):
         more = json.loads((ROOT / f"experiments/results/{name}.json").read_text())
         assert table([ActionError(**r) for r in more]).strip() in text
-    configs = ROOT / "experiments/configs"
-    named = set(re.findall(r"experiments/configs/(\w+\.py)", text))
-    assert named and all((configs / n).is_file() for n in named)
-    for config in configs.glob("*.py"):
-        made = runpy.run_path(str(config))
-        assert isinstance(made["CONFIG"], TrainConfig | DatasetConfig)
-        assert all(f"{word}:" in made["__doc__"] for word in ("Command", "Cost", "Result"))
+    for file, kind in (("datasets", DatasetConfig), ("training", TrainConfig)):
+        path = ROOT / f"experiments/{file}.toml"
+        named = set(re.findall(rf"experiments/{file}\.toml#([\w-]+)", text))
+        tables = tomllib.loads(path.read_text())
+        assert named and named <= set(tables)
+        assert all(isinstance(read_config(f"{path}#{n}", kind), kind) for n in tables)
     for name in list_weights():
         card = read_card(name)
         for line in card["measured"]:

@@ -10,49 +10,55 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from physxnet_jax._environment import cache_folder, free_programs, keep_programs, keeps_programs
-from physxnet_jax.files import whole_file
+from physxnet_jax._environment import (
+    cache_folder,
+    clear_caches_if_full,
+    enable_compilation_cache,
+    uses_compilation_cache,
+)
+from physxnet_jax.files import atomic_write
 
 
-def test_what_is_set_already_stays(monkeypatch, tmp_path):
+def test_existing_cache_settings_are_kept(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder() == tmp_path / "physxnet_jax"
     env = {"JAX_COMPILATION_CACHE_DIR": "/elsewhere"}
-    keep_programs(env)
+    enable_compilation_cache(env)
     assert env["JAX_COMPILATION_CACHE_DIR"] == "/elsewhere"
     empty: dict[str, str] = {}
-    keep_programs(empty)
+    enable_compilation_cache(empty)
     folder = pathlib.Path(empty["JAX_COMPILATION_CACHE_DIR"])
     assert folder.parent == tmp_path / "physxnet_jax" / "programs"
 
 
-def test_processors_have_folders_of_their_own(monkeypatch):
+def test_each_processor_has_its_own_cache_folder(monkeypatch):
     seen = set()
     for flags in ("flags: sse avx", "flags: sse"):
         monkeypatch.setattr("physxnet_jax._environment._processor", lambda f=flags: f)
         env: dict[str, str] = {}
-        keep_programs(env)
+        enable_compilation_cache(env)
         seen.add(env["JAX_COMPILATION_CACHE_DIR"])
     assert len(seen) == 2
 
 
-def test_programs_are_forgotten_before_maps_run_out(monkeypatch, tmp_path):
+def test_caches_are_cleared_before_memory_maps_run_out(monkeypatch, tmp_path):
     freed = []
     monkeypatch.setattr(jax, "clear_caches", lambda: freed.append(True))
     most, held = tmp_path / "most", tmp_path / "held"
     monkeypatch.setattr("physxnet_jax._environment._MAPS_ALLOWED", most)
     monkeypatch.setattr("physxnet_jax._environment._MAPS_HELD", held)
-    assert not free_programs(), "a system that doesn't say has no bound"
+    assert not clear_caches_if_full(), "a system that doesn't say has no bound"
     most.write_text("100\n")
     held.write_text("map\n" * 59)
-    assert not free_programs() and not freed
+    assert not clear_caches_if_full() and not freed
     held.write_text("map\n" * 60)
-    assert free_programs() and len(freed) == 1
-    assert not free_programs(0.7)
+    assert clear_caches_if_full() and len(freed) == 1
+    assert not clear_caches_if_full(0.7)
 
 
+@pytest.mark.release
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="maps are counted by Linux")
-def test_forgotten_programs_give_their_maps_back():
+def test_cleared_programs_release_their_memory_maps():
     def held() -> int:
         return pathlib.Path("/proc/self/maps").read_bytes().count(b"\n")
 
@@ -61,7 +67,7 @@ def test_forgotten_programs_give_their_maps_back():
         jax.jit(lambda x, k=k: jnp.cumsum(jnp.sin(x) * k) @ x)(jnp.ones(8 + k))
     full = held()
     assert full > start + 40
-    assert free_programs(0.0) and held() < (start + full) / 2
+    assert clear_caches_if_full(0.0) and held() < (start + full) / 2
 
 
 @pytest.fixture
@@ -81,7 +87,8 @@ def run(tmp_path):
     return one
 
 
-def test_a_second_run_finds_its_programs_and_says_nothing_of_them(run, tmp_path):
+@pytest.mark.release
+def test_second_run_uses_the_compilation_cache_silently(run, tmp_path):
     words = ("dress", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "2", "--quiet")
     first = run(*words, "--out", "a.npz")
     assert first.returncode == 0, first.stderr
@@ -93,22 +100,24 @@ def test_a_second_run_finds_its_programs_and_says_nothing_of_them(run, tmp_path)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
 
 
-def test_only_commands_that_do_not_measure_compilation_keep_programs():
-    assert keeps_programs(["/usr/bin/physxnet", "dress", "walk"])
-    assert keeps_programs(["physxnet"]) and keeps_programs(["C:/bin/physxnet.exe", "train"])
-    assert not keeps_programs(["physxnet", "bench", "net"])
-    assert not keeps_programs(["physxnet", "effects", "scene.toml"])
-    assert not keeps_programs(["my_program.py", "dress"])
+def test_compilation_cache_is_off_for_commands_that_measure_it():
+    assert uses_compilation_cache(["/usr/bin/physxnet", "dress", "walk"])
+    assert uses_compilation_cache(["physxnet"]) and uses_compilation_cache(
+        ["C:/bin/physxnet.exe", "train"]
+    )
+    assert not uses_compilation_cache(["physxnet", "bench", "net"])
+    assert not uses_compilation_cache(["physxnet", "effects", "scene.toml"])
+    assert not uses_compilation_cache(["my_program.py", "dress"])
 
 
-def test_threads_write_one_file_side_by_side(tmp_path):
+def test_concurrent_atomic_writes_leave_one_complete_file(tmp_path):
     """Every writer has a part of its own; the file is one of them, whole."""
     path, both = tmp_path / "a.txt", threading.Barrier(4)
     failed = []
 
     def write(text):
         try:
-            with whole_file(path) as part:
+            with atomic_write(path) as part:
                 part.write_text(text)
                 both.wait(10)
         except Exception as error:

@@ -12,13 +12,15 @@ ROOT = pathlib.Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 PAGES = [p for p in sorted(ROOT.glob("docs/*.md")) if "```python" in p.read_text()]
 
+pytestmark = pytest.mark.release
 
-def test_they_are_numbered_without_a_gap():
-    assert [p.name[:2] for p in EXAMPLES] == [f"{k:02d}" for k in range(7)]
+
+def test_examples_are_numbered_without_gaps():
+    assert [p.name[:2] for p in EXAMPLES] == [f"{k:02d}" for k in range(8)]
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
-def test_an_example_runs(path, tmp_path):
+def test_examples_run(path, tmp_path):
     """As a user runs it: a process of its own, in a folder of its own."""
     done = subprocess.run(
         [sys.executable, str(path)],
@@ -40,11 +42,11 @@ def test_an_example_runs(path, tmp_path):
         assert after < 0.7 * before and worn < 1.05 * after
 
 
-def test_the_notebook_runs_and_holds_no_output(capsys):
-    told = json.loads((ROOT / "examples/differentiable_layer.ipynb").read_text())
-    assert told["nbformat"] == 4 and len({c["id"] for c in told["cells"]}) == len(told["cells"])
+def test_notebook_runs_and_contains_no_output(capsys):
+    nb = json.loads((ROOT / "examples/differentiable_layer.ipynb").read_text())
+    assert nb["nbformat"] == 4 and len({c["id"] for c in nb["cells"]}) == len(nb["cells"])
     there = {}
-    for cell in told["cells"]:
+    for cell in nb["cells"]:
         if cell["cell_type"] == "code":
             assert cell["outputs"] == [] and cell["execution_count"] is None
             exec("".join(cell["source"]), there)
@@ -53,14 +55,14 @@ def test_the_notebook_runs_and_holds_no_output(capsys):
 
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda p: p.stem)
-def test_the_code_of_a_page_runs(path, tmp_path, monkeypatch):
+def test_code_of_each_page_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     there = {}
     for code in re.findall(r"```python\n(.*?)```", path.read_text(), re.S):
         exec(code, there)
 
 
-def test_the_pages_build(tmp_path):
+def test_documentation_builds_without_warnings(tmp_path):
     """Sphinx makes them without a warning: every reference is found, every page listed."""
     pytest.importorskip("sphinx_book_theme")
     words = ["-m", "sphinx", "-W", "-q", "-b", "html", str(ROOT / "docs"), str(tmp_path)]

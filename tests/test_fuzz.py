@@ -20,16 +20,10 @@ import pytest
 import trimesh
 from hypothesis import HealthCheck, given, settings, strategies as st
 
-from physxnet_jax.dressing import load_scene
+from physxnet_jax.dressing import load_scene, read_character
 from physxnet_jax.errors import FormatError, PhysXNetError
-from physxnet_jax.io import (
-    load_predictor,
-    read_character,
-    read_mdd,
-    read_mesh,
-    read_obj,
-    read_pc2,
-)
+from physxnet_jax.io import read_mdd, read_mesh, read_obj, read_pc2
+from physxnet_jax.models import load_predictor
 from physxnet_jax.motion import load_motion, read_amc, read_bvh, read_joint_map
 
 _SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[0] / "samples.py"))
@@ -245,7 +239,7 @@ def _picture(path):
 
 def _card(path):
     """Weights whose card is damaged; the tensors and their hash are as they were."""
-    source = pathlib.Path(sys.modules["physxnet_jax.io"].__file__).parent / "weights/nano"
+    source = pathlib.Path(sys.modules["physxnet_jax.models"].__file__).parent / "weights/nano"
     folder = path.parent / "weights"
     folder.mkdir(exist_ok=True)
     shutil.copy(source / "weights.safetensors", folder)
@@ -255,7 +249,7 @@ def _card(path):
 
 def _tensors(path):
     """Damaged tensors with the hash that belongs to them: only their content is wrong."""
-    source = pathlib.Path(sys.modules["physxnet_jax.io"].__file__).parent / "weights/nano"
+    source = pathlib.Path(sys.modules["physxnet_jax.models"].__file__).parent / "weights/nano"
     folder = path.parent / "weights"
     folder.mkdir(exist_ok=True)
     blob = path.read_bytes()
@@ -268,7 +262,7 @@ def _tensors(path):
 
 def _weights(name):
     return lambda folder: (
-        pathlib.Path(sys.modules["physxnet_jax.io"].__file__).parent / "weights/nano" / name
+        pathlib.Path(sys.modules["physxnet_jax.models"].__file__).parent / "weights/nano" / name
     ).read_bytes()
 
 
@@ -353,6 +347,7 @@ def tried(name: str, folder: pathlib.Path, blob: bytes) -> bool:
     return True
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_read_or_refused(name, tmp_path):
     make, _, _, count = READERS[name]
@@ -381,7 +376,7 @@ HUGE = {
 
 
 @pytest.mark.parametrize("name", HUGE)
-def test_a_huge_number_in_a_small_file_takes_no_memory(name, tmp_path):
+def test_huge_numbers_in_small_files_take_no_memory(name, tmp_path):
     tracemalloc.start()
     assert not tried(name, tmp_path, HUGE[name])
     peak = tracemalloc.get_traced_memory()[1]
@@ -407,13 +402,13 @@ def test_frames_times_joints_are_bounded(tmp_path):
         assert peak < 50e6
 
 
-def test_an_archive_that_announces_more_than_it_holds_takes_no_memory(tmp_path):
+def test_oversized_archive_headers_take_no_memory(tmp_path):
     import io
     import zipfile
 
     header = io.BytesIO()
-    told = {"descr": "<f4", "fortran_order": False, "shape": (10**9, 31, 4)}
-    np.lib.format.write_array_header_1_0(header, told)
+    fields = {"descr": "<f4", "fortran_order": False, "shape": (10**9, 31, 4)}
+    np.lib.format.write_array_header_1_0(header, fields)
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
         file.writestr("rotations.npy", header.getvalue() + b"\0" * 64)
         file.writestr("root.npy", header.getvalue())

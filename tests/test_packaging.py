@@ -24,10 +24,12 @@ EXTRAS = {
     ),
     "export": (
         "import physxnet_jax as px; from physxnet_jax.dressing import export_dresser;"
-        " export_dresser('dresser', px.make_dresser(['bottom'], weights='nano'))"
+        " export_dresser('dresser', px.make_dresser(['bottom'], inference=px.Inference(weights='nano')))"
     ),
     "viewer": "from physxnet_jax.viewer._server import start_server; start_server('127.0.0.1', 8400)",
 }
+
+pytestmark = pytest.mark.release
 
 
 def run(*words, **more):
@@ -56,7 +58,7 @@ def python(wheel, tmp_path_factory):
     return path
 
 
-def test_the_wheel_holds_weights_types_and_licence_and_nothing_else(wheel):
+def test_wheel_contains_only_the_package_with_weights_types_and_licence(wheel):
     with zipfile.ZipFile(wheel) as file:
         names = file.namelist()
     assert "physxnet_jax/py.typed" in names
@@ -67,7 +69,7 @@ def test_the_wheel_holds_weights_types_and_licence_and_nothing_else(wheel):
     assert wheel.stat().st_size < 30e6
 
 
-def test_the_command_works_where_nothing_else_is_installed(python, tmp_path):
+def test_command_works_without_optional_dependencies(python, tmp_path):
     """By its own network, and packaged weights."""
     words = ["dress", "walk", "--wear", "bottom", "--frames", "2"]
     out = run(python.parent / "physxnet", *words, "-o", tmp_path / "a.npz", cwd=tmp_path)
@@ -77,7 +79,7 @@ def test_the_command_works_where_nothing_else_is_installed(python, tmp_path):
     assert len(cloth) == 2 and np.isfinite(cloth).all()
 
 
-def test_each_extra_is_asked_for_by_name_and_then_enough(python, wheel, tmp_path):
+def test_missing_extras_are_named_and_sufficient_once_installed(python, wheel, tmp_path):
     scripts = {
         extra: f"try:\n    {call}\nexcept ImportError as e:\n    print('needs', e)\n"
         for extra, call in EXTRAS.items()
@@ -90,11 +92,11 @@ def test_each_extra_is_asked_for_by_name_and_then_enough(python, wheel, tmp_path
         assert "needs" not in run(python, "-c", script, cwd=tmp_path), extra
 
 
-def test_a_run_is_watched_where_the_train_extra_is(python, wheel, tmp_path):
+def test_tensorboard_events_are_written_only_with_the_train_extra(python, wheel, tmp_path):
     """Without it training goes on, unwatched."""
     script = (
-        "import pathlib; from physxnet_jax.training._watch import Board\n"
-        "b = Board(pathlib.Path('run')); b.write({'loss': 1.0}, 0); b.close()\n"
+        "import pathlib; from physxnet_jax.training._monitor import TensorBoardLogger\n"
+        "b = TensorBoardLogger(pathlib.Path('run')); b.write({'loss': 1.0}, 0); b.close()\n"
         "print(len(list(pathlib.Path('.').rglob('events.*'))))"
     )
     assert run(python, "-c", script, cwd=tmp_path).split()[-1] == "0"
@@ -102,7 +104,7 @@ def test_a_run_is_watched_where_the_train_extra_is(python, wheel, tmp_path):
     assert run(python, "-c", script, cwd=tmp_path).split()[-1] == "1"
 
 
-def test_importing_loads_nothing_and_names_load_no_optional_library():
+def test_imports_are_lazy_and_load_no_optional_library():
     script = """
 import json, sys
 import physxnet_jax as px
@@ -121,11 +123,11 @@ print(json.dumps([alone, sorted(sys.modules), dir(px)]))
     assert set(physxnet_jax.__all__) <= set(names)
 
 
-def test_the_table_of_rooms_is_whole():
+def test_package_table_covers_all_public_names():
     """Each public name is found, and lives where the table says."""
-    told = {name for names in physxnet_jax._ROOMS.values() for name in names}
-    assert told == set(physxnet_jax.__all__) - {"__version__"}
-    for name in told:
+    public_names = {name for names in physxnet_jax._PACKAGES.values() for name in names}
+    assert public_names == set(physxnet_jax.__all__) - {"__version__"}
+    for name in public_names:
         assert getattr(physxnet_jax, name) is not None
     assert physxnet_jax.motion.load_motion is physxnet_jax.load_motion
     with pytest.raises(AttributeError, match="no attribute 'undress'"):

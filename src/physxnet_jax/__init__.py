@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from ._environment import (
     check_jaxlib as _check_jaxlib,
+    enable_compilation_cache as _enable_compilation_cache,
     is_command as _is_command,
-    keep_programs as _keep_programs,
-    keeps_programs as _keeps_programs,
+    uses_compilation_cache as _uses_compilation_cache,
 )
 from ._version import __version__ as __version__
 
-# A command is a process of its own; a program that imports this package decides for itself.
-if _keeps_programs(_sys.argv):
-    _keep_programs()
+# A command is its own process; a program that imports this package decides for itself.
+if _uses_compilation_cache(_sys.argv):
+    _enable_compilation_cache()
 
-# `physxnet doctor` must be able to say what is wrong.
+# `physxnet doctor` must be able to report what is wrong.
 if not (_is_command(_sys.argv) and _sys.argv[1:2] == ["doctor"]):
     _check_jaxlib()
 
@@ -33,27 +33,31 @@ if _TYPE_CHECKING:
         Clothed as Clothed,
         DressedClip as DressedClip,
         Dresser as Dresser,
+        Inference as Inference,
+        Simulation as Simulation,
         clothe as clothe,
-        clothe_frame as clothe_frame,
+        clothe_step as clothe_step,
         dress as dress,
+        fit_garment as fit_garment,
+        init_stream as init_stream,
+        inspect_garment as inspect_garment,
         load_character as load_character,
         make_dresser as make_dresser,
-        start_clothing as start_clothing,
         with_shape as with_shape,
     )
     from .errors import PhysXNetError as PhysXNetError
-    from .garment import Fabric as Fabric, Garment as Garment, template as template
-    from .io import (
-        fit_garment as fit_garment,
-        inspect_garment as inspect_garment,
+    from .garment import (
+        Fabric as Fabric,
+        Garment as Garment,
         load_garment as load_garment,
-        load_predictor as load_predictor,
-        write_clip as write_clip,
+        template as template,
     )
+    from .io import write_clip as write_clip
     from .models import (
         Predictor as Predictor,
+        bind_garment as bind_garment,
         dress_frames as dress_frames,
-        make_wearable as make_wearable,
+        load_predictor as load_predictor,
         pad_clip as pad_clip,
     )
     from .motion import (
@@ -62,33 +66,70 @@ if _TYPE_CHECKING:
         load_motion as load_motion,
     )
     from .simulation import Scene as Scene, simulate as simulate
-    from .uv import bind as bind, make_atlas as make_atlas
+    from .uv import (
+        bind as bind,
+        body_maps as body_maps,
+        garment_map as garment_map,
+        make_atlas as make_atlas,
+        transference as transference,
+    )
 
-# Loaded when first asked for: `import physxnet_jax` alone costs nothing.
-_ROOMS = {
-    "body": ("Body", "load_body"),
+# Loaded on first use: `import physxnet_jax` alone costs nothing.
+_PACKAGES = {
+    "body": (
+        "Body",
+        "load_body",
+    ),
     "dressing": (
         "Character",
         "Clothed",
         "DressedClip",
         "Dresser",
+        "Inference",
+        "Simulation",
         "clothe",
-        "clothe_frame",
+        "clothe_step",
         "dress",
+        "fit_garment",
+        "init_stream",
+        "inspect_garment",
         "load_character",
         "make_dresser",
-        "start_clothing",
         "with_shape",
     ),
     "errors": ("PhysXNetError",),
-    "garment": ("Fabric", "Garment", "template"),
-    "io": ("fit_garment", "inspect_garment", "load_garment", "load_predictor", "write_clip"),
-    "models": ("Predictor", "dress_frames", "make_wearable", "pad_clip"),
-    "motion": ("Motion", "inspect_motion", "load_motion"),
-    "simulation": ("Scene", "simulate"),
-    "uv": ("bind", "make_atlas"),
+    "garment": (
+        "Fabric",
+        "Garment",
+        "load_garment",
+        "template",
+    ),
+    "io": ("write_clip",),
+    "models": (
+        "Predictor",
+        "bind_garment",
+        "dress_frames",
+        "load_predictor",
+        "pad_clip",
+    ),
+    "motion": (
+        "Motion",
+        "inspect_motion",
+        "load_motion",
+    ),
+    "simulation": (
+        "Scene",
+        "simulate",
+    ),
+    "uv": (
+        "bind",
+        "body_maps",
+        "garment_map",
+        "make_atlas",
+        "transference",
+    ),
 }
-_HOME = {name: room for room, names in _ROOMS.items() for name in names}
+_HOME = {name: package for package, names in _PACKAGES.items() for name in names}
 
 __all__ = [
     "Body",
@@ -98,17 +139,23 @@ __all__ = [
     "Dresser",
     "Fabric",
     "Garment",
+    "Inference",
     "Motion",
     "PhysXNetError",
     "Predictor",
     "Scene",
+    "Simulation",
     "__version__",
     "bind",
+    "bind_garment",
+    "body_maps",
     "clothe",
-    "clothe_frame",
+    "clothe_step",
     "dress",
     "dress_frames",
     "fit_garment",
+    "garment_map",
+    "init_stream",
     "inspect_garment",
     "inspect_motion",
     "load_body",
@@ -118,18 +165,17 @@ __all__ = [
     "load_predictor",
     "make_atlas",
     "make_dresser",
-    "make_wearable",
     "pad_clip",
     "simulate",
-    "start_clothing",
     "template",
+    "transference",
     "with_shape",
     "write_clip",
 ]
 
 
 def __getattr__(name: str) -> object:
-    """Loads the room that a public name lives in; rooms themselves as well."""
+    """Imports the package that a public name lives in; packages themselves as well."""
     if name in _HOME:
         value = getattr(_importlib.import_module(f".{_HOME[name]}", __name__), name)
         globals()[name] = value

@@ -1,4 +1,4 @@
-"""What is installed, whether it can be trusted with numbers, and where programs are kept."""
+"""Checks of the installed jaxlib, cache folders and JAX's compilation cache."""
 
 import hashlib
 import importlib.metadata
@@ -19,11 +19,11 @@ _FLAG = "xla_cpu_experimental_ynn_fusion_type="
 
 
 def jaxlib_problem(version: str, flags: str = "") -> str | None:
-    """Why a jaxlib can't be used, or None.
+    """Returns why a jaxlib version can't be used, or None if it can.
 
     Args:
         version: Version of jaxlib.
-        flags: ``XLA_FLAGS``; the fault is off if its fusion is switched off there.
+        flags: ``XLA_FLAGS``; disabling the faulty fusion there avoids the fault.
     """
     words = flags.split()
     if version not in BROKEN_JAXLIB or any(w.endswith(_FLAG) for w in words):
@@ -35,10 +35,10 @@ def jaxlib_problem(version: str, flags: str = "") -> str | None:
 
 
 def check_jaxlib() -> None:
-    """Refuses a jaxlib known to compute wrong numbers.
+    """Raises an error if the installed jaxlib is known to compute wrong results.
 
     Raises:
-        BrokenInstallError: The text names a version to install.
+        BrokenInstallError: The message names a version to install.
     """
     problem = jaxlib_problem(importlib.metadata.version("jaxlib"), os.environ.get("XLA_FLAGS", ""))
     if problem is not None:
@@ -46,22 +46,22 @@ def check_jaxlib() -> None:
 
 
 def cache_folder() -> pathlib.Path:
-    """Where this machine's times and programs are kept: $XDG_CACHE_HOME or ~/.cache."""
+    """Folder of this machine's timings and programs, in $XDG_CACHE_HOME or ~/.cache."""
     home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
     return pathlib.Path(home) / "physxnet_jax"
 
 
-def programs_folder(what: str = "programs") -> pathlib.Path:
-    """Where compiled programs are kept, for this kind of processor alone.
+def compilation_cache_folder(what: str = "programs") -> pathlib.Path:
+    """Folder of compiled programs for this type of processor.
 
-    A home may be shared by machines of which one can't run what another has compiled.
+    Machines that share a home folder can't always run each other's programs.
     """
     machine = f"{platform.machine()}-{hashlib.sha256(_processor().encode()).hexdigest()[:8]}"
     return cache_folder() / what / machine
 
 
-def keeps_programs(words: Sequence[str]) -> bool:
-    """Whether a process of these words is a command that should keep its programs.
+def uses_compilation_cache(words: Sequence[str]) -> bool:
+    """Whether a command line is a `physxnet` command that should cache its programs.
 
     Commands that measure compilation must compile.
     """
@@ -69,47 +69,47 @@ def keeps_programs(words: Sequence[str]) -> bool:
 
 
 def is_command(words: Sequence[str]) -> bool:
-    """Whether a process of these words is the command `physxnet`."""
+    """Whether a command line runs `physxnet`."""
     return bool(words) and pathlib.PurePath(words[0]).stem == "physxnet"
 
 
-def keep_programs(environment: MutableMapping[str, str] | None = None) -> None:
-    """Lets JAX keep compiled programs for the next process; before jax is imported.
+def enable_compilation_cache(environment: MutableMapping[str, str] | None = None) -> None:
+    """Enables JAX's persistent compilation cache; call it before jax is imported.
 
-    What is already set stays as it is.
+    Variables that are already set keep their values.
 
     Args:
-        environment: Variables to set; the process's own by default.
+        environment: Environment variables to set; those of this process by default.
     """
     env = os.environ if environment is None else environment
-    env.setdefault("JAX_COMPILATION_CACHE_DIR", str(programs_folder()))
-    # The small ones as well: there are a hundred, and together they take seconds.
+    env.setdefault("JAX_COMPILATION_CACHE_DIR", str(compilation_cache_folder()))
+    # Cache small programs too: there are a hundred, which together take seconds.
     env.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-    # Loading from the cache, XLA takes its own hints for missing instructions and says so
-    # as an error (jax-ml/jax#38445).
+    # On loading from the cache, XLA mistakes its own hints for missing instructions and
+    # logs an error (jax-ml/jax#38445).
     env.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 
-def free_programs(share: float = 0.6) -> bool:
-    """Forgets what was compiled before it takes all memory maps that a process may have.
+def clear_caches_if_full(share: float = 0.6) -> bool:
+    """Clears JAX's caches before the process runs out of memory maps.
 
-    Every compiled function holds some; where there are none left the compiler ends the
-    process, however much memory is free. Where maps aren't bounded (all systems but Linux)
-    nothing is done.
+    Every compiled function holds some memory maps. When none are left, the compiler aborts
+    the process, however much memory is free. Systems other than Linux have no such limit;
+    there the function does nothing.
 
     Args:
-        share: Of all maps, from which on programs are forgotten.
+        share: Fraction of the allowed maps at which the caches are cleared.
 
     Returns:
-        Whether they were.
+        Whether the caches were cleared.
     """
     try:
-        most = int(_MAPS_ALLOWED.read_text())
+        limit = int(_MAPS_ALLOWED.read_text())
         with _MAPS_HELD.open("rb") as lines:
-            held = sum(1 for _ in lines)
+            used = sum(1 for _ in lines)
     except (OSError, ValueError):
         return False
-    if held < share * most:
+    if used < share * limit:
         return False
     import jax
 
@@ -118,7 +118,7 @@ def free_programs(share: float = 0.6) -> bool:
 
 
 def processor_name() -> str:
-    """What the processor is called, as far as the system says it."""
+    """Name of the processor, as far as the system reports it."""
     return _processor("model name", "CPU part")
 
 

@@ -1,14 +1,14 @@
-"""Exceptions whose text says what was got, what was expected and how to fix it."""
+"""Exceptions whose messages state what was found, what was expected and how to fix it."""
 
 import math
 import numbers
 
-# Files are quoted in errors, and may hold anything at any length.
+# Messages quote file contents, which can be arbitrarily long.
 _MOST, _LAST = 1200, 500
 
 
 class PhysXNetError(Exception):
-    """Base of every error this package raises on purpose; of a long text the middle is left out."""
+    """Base class of errors this package raises on purpose; long messages lose their middle."""
 
     def __init__(self, text: str = "") -> None:
         if len(text) > _MOST:
@@ -17,7 +17,7 @@ class PhysXNetError(Exception):
 
 
 class MeshError(PhysXNetError, ValueError):
-    """A mesh can't be used as it is (shape, topology, scale, position)."""
+    """A mesh can't be used because of its shape, topology, scale or position."""
 
 
 class MotionError(PhysXNetError, ValueError):
@@ -25,41 +25,41 @@ class MotionError(PhysXNetError, ValueError):
 
     @classmethod
     def at(cls, path: object, line: int | None, problem: str, fix: str) -> "MotionError":
-        """Error text with file, line and fix, in that order."""
+        """Builds an error that names the file, line, problem and fix, in that order."""
         place = f"{path}:{line}" if line is not None else f"{path}"
         return cls(f"{place}: {problem}. {fix}")
 
 
 class FormatError(PhysXNetError, ValueError):
-    """A file's name or content isn't of a format this package knows."""
+    """A file's name or content isn't in a supported format."""
 
 
 class MissingDependencyError(PhysXNetError, ImportError):
-    """An optional library is needed; the text says which extra installs it."""
+    """An optional dependency is missing; the message names the extra that installs it."""
 
 
 class SimulationError(PhysXNetError, RuntimeError):
-    """A rollout ended with a status that says its result can't be trusted."""
+    """A rollout ended with a status that marks its result as unreliable."""
 
 
 class WeightsError(PhysXNetError, ValueError):
-    """Weights, their config or their atlas don't fit together."""
+    """Weights, their config and their atlas are inconsistent."""
 
 
 class BrokenInstallError(PhysXNetError, RuntimeError):
-    """The installed jaxlib is known to compute wrong numbers."""
+    """The installed jaxlib is known to compute wrong results."""
 
 
 def check_numbers(owner: object, *names: str, zero: bool = False) -> None:
-    """Fails unless attributes of settings are finite and positive; None is left out.
+    """Checks that attributes of a settings object are finite and positive; skips None.
 
     Args:
-        owner: The settings.
-        *names: Of the attributes.
-        zero: Whether zero will do.
+        owner: The settings object.
+        *names: Attributes to check.
+        zero: Whether zero is allowed.
 
     Raises:
-        ValueError: One isn't; attribute and value are named.
+        ValueError: An attribute is invalid; the message names it and its value.
     """
     for name in names:
         value = getattr(owner, name)
@@ -67,20 +67,20 @@ def check_numbers(owner: object, *names: str, zero: bool = False) -> None:
             continue
         number = isinstance(value, numbers.Real) and math.isfinite(value)
         if not number or value < 0 or (value == 0 and not zero):
-            wanted = "a number from 0 up" if zero else "a positive number"
+            wanted = "a number of at least 0" if zero else "a positive number"
             raise ValueError(f"{name} is {value}, expected {wanted}")
 
 
 def check_counts(owner: object, *names: str) -> None:
-    """Fails unless attributes of settings are whole numbers from 1 up.
+    """Checks that attributes of a settings object are whole numbers of at least 1.
 
     Raises:
-        ValueError: One isn't; attribute and value are named.
+        ValueError: An attribute is invalid; the message names it and its value.
     """
     for name in names:
         value = getattr(owner, name)
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
-            raise ValueError(f"{name} is {value}, expected a whole number from 1 up")
+            raise ValueError(f"{name} is {value}, expected a whole number of at least 1")
 
 
 __all__ = [

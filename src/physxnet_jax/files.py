@@ -1,4 +1,4 @@
-"""Writing files whole or not at all, reading archives of unknown origin."""
+"""Atomic file writing, JSON logs and safe reading of untrusted archives."""
 
 import contextlib
 import json
@@ -17,21 +17,21 @@ from .errors import FormatError
 
 
 @contextlib.contextmanager
-def whole_file(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
-    """A path to write to that becomes ``path`` on success and vanishes on failure.
+def atomic_write(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
+    """Yields a temporary path that replaces ``path`` on success and is deleted on failure.
 
     Example:
         >>> import tempfile
         >>> folder = pathlib.Path(tempfile.mkdtemp())
-        >>> with whole_file(folder / "a.txt") as part:
+        >>> with atomic_write(folder / "a.txt") as part:
         ...     _ = part.write_text("done")
         >>> [p.name for p in folder.iterdir()]
         ['a.txt']
     """
     path = pathlib.Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # The suffix stays: some writers choose their format by it. Processes and threads may
-    # write side by side what is the same.
+    # The name keeps the suffix because some writers choose the format by it. The ids let
+    # processes and threads write the same file concurrently.
     part = path.with_name(f".part-{os.getpid()}-{threading.get_ident()}-{path.name}")
     try:
         yield part
@@ -41,7 +41,7 @@ def whole_file(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def json_text(values: object) -> str:
-    """JSON of nested values; paths are text, and what isn't finite is null: JSON has no NaN.
+    """Nested values as JSON; paths become strings, non-finite numbers null (JSON has no NaN).
 
     Example:
         >>> print(json_text({"file": pathlib.PurePosixPath("a.obj"), "gap": math.inf}))
@@ -50,27 +50,27 @@ def json_text(values: object) -> str:
          "gap": null
         }
     """
-    return json.dumps(_plain(values), indent=1, allow_nan=False)
+    return json.dumps(_to_jsonable(values), indent=1, allow_nan=False)
 
 
-def _plain(value: object) -> object:
+def _to_jsonable(value: object) -> object:
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
+        return {str(k): _to_jsonable(v) for k, v in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [_to_jsonable(v) for v in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, pathlib.PurePath) else value
 
 
 def write_json(path: str | pathlib.Path, values: object) -> None:
-    """Writes `json_text` of nested values, whole or not at all."""
-    with whole_file(path) as part:
+    """Writes `json_text` of nested values atomically."""
+    with atomic_write(path) as part:
         part.write_text(json_text(values) + "\n", encoding="utf-8")
 
 
 def append_line(path: str | pathlib.Path, values: Mapping[str, Any]) -> None:
-    """Adds a line of JSON to a log; one that a kill cut short before it stays alone."""
+    """Appends a line of JSON to a log, after ending a previous line that was cut short."""
     with pathlib.Path(path).open("a+b") as log:
         if log.tell():
             log.seek(-1, os.SEEK_END)
@@ -80,7 +80,7 @@ def append_line(path: str | pathlib.Path, values: Mapping[str, Any]) -> None:
 
 
 def read_lines(path: str | pathlib.Path) -> list[dict[str, Any]]:
-    """A log of `append_line`: none if there is no file; a line that was cut is left out."""
+    """Reads a log of `append_line`; a missing file is empty, truncated lines are skipped."""
     path = pathlib.Path(path)
     if not path.is_file():
         return []
@@ -92,22 +92,22 @@ def read_lines(path: str | pathlib.Path) -> list[dict[str, Any]]:
 
 
 def is_file(path: str | pathlib.Path) -> bool:
-    """Whether there is such a file: none of a name that the system can't have."""
+    """Whether a file exists; False for names that the system doesn't allow."""
     return os.path.isfile(path)
 
 
 def check_writable(path: str | pathlib.Path) -> None:
-    """Fails where a file couldn't be written; makes nothing.
+    """Checks that a file can be written, without creating it.
 
     Raises:
-        FormatError: A folder of that name, or a place where nothing can be made.
+        FormatError: The path is a folder, or nothing can be written there.
     """
     path = pathlib.Path(path)
     if path.is_dir():
-        raise FormatError(f"{path}: a folder. Name a file in it.")
-    there = next((p for p in path.absolute().parents if p.exists()), pathlib.Path("/"))
+        raise FormatError(f"{path}: this is a folder. Name a file in it.")
+    existing = next((p for p in path.absolute().parents if p.exists()), pathlib.Path("/"))
     try:
-        with tempfile.TemporaryFile(dir=there):
+        with tempfile.TemporaryFile(dir=existing):
             pass
     except OSError as error:
         raise FormatError(
@@ -118,33 +118,33 @@ def check_writable(path: str | pathlib.Path) -> None:
 def read_arrays(
     path: str | pathlib.Path, names: Sequence[str] | None = None, *, limit: int = 2_000_000_000
 ) -> dict[str, np.ndarray]:
-    """Arrays of an `.npz`, by name; those that aren't in it are left out.
+    """Reads arrays of an `.npz` by name; skips names that aren't in it.
 
-    Nothing is unpickled. What an array's header announces is compared with what the
-    archive holds before memory is asked for.
+    Nothing is unpickled. The size in an array's header is compared with the size in the
+    archive before memory is allocated.
 
     Args:
         path: The archive.
-        names: Which arrays to read; all if omitted.
-        limit: Largest size of all of them together, unpacked [bytes].
+        names: Arrays to read; all if omitted.
+        limit: Maximum total size of the arrays, uncompressed [bytes].
 
     Raises:
-        ValueError: Not such an archive, an array of objects, a header that lies, or
-            too much data.
+        ValueError: The file isn't an `.npz` archive, an array holds Python objects, a
+            header contradicts the data, or the limit is exceeded.
         OSError: The file can't be opened.
     """
     out: dict[str, np.ndarray] = {}
     total = 0
-    # From here on an error of the system means an archive that points nowhere.
+    # Once the file opens, any later OSError means invalid offsets in the archive.
     with pathlib.Path(path).open("rb"):
         pass
     try:
         with zipfile.ZipFile(path) as archive:
-            held = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
-            for name in held if names is None else names:
-                if name not in held:
+            members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
+            for name in members if names is None else names:
+                if name not in members:
                     continue
-                info = held[name]
+                info = members[name]
                 total += info.file_size
                 if total > limit:
                     raise ValueError(f"over {limit / 1e9:.1f} GB of data")
@@ -154,7 +154,7 @@ def read_arrays(
                     out[name] = np.lib.format.read_array(member, allow_pickle=False)
     except ValueError:
         raise
-    # NumPy parses a header as Python; what is in it may break in any way.
+    # NumPy parses headers as Python literals: a broken one may raise any exception.
     except Exception as error:
         raise ValueError(f"not an archive of arrays ({error})") from error
     return out
@@ -167,7 +167,7 @@ def _check_header(member: Any, name: str, size: int) -> None:
         (2, 0): np.lib.format.read_array_header_2_0,
     }
     if version not in readers:
-        raise ValueError(f"'{name}' is of format {version}")
+        raise ValueError(f"'{name}' has the unsupported format version {version}")
     shape, _, dtype = readers[version](member)
     if dtype.hasobject:
         raise ValueError(f"'{name}' holds Python objects, which are never loaded")

@@ -15,6 +15,7 @@ from physxnet_jax.body import (
     bone_directions,
     forward_kinematics,
     load_body,
+    t_pose,
 )
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import template
@@ -52,7 +53,7 @@ def numpy_body(shape, quaternions, root):
     return out
 
 
-def test_agrees_with_numpy_to_ten_micrometres(body):
+def test_vertices_match_numpy_within_ten_micrometres(body):
     rng = np.random.default_rng(0)
     for _ in range(3):
         shape = rng.uniform(0, 1, len(body.shape_names)).astype(np.float32)
@@ -78,7 +79,7 @@ def test_mesh_is_the_closed_base_mesh(body):
 
 def test_t_pose_has_level_arms_and_straight_legs(body):
     rest = body.rest_vertices(body.default_shape())
-    world, _ = body.transforms(rest, body.t_pose(), jnp.zeros(3))
+    world, _ = body.transforms(rest, t_pose(body), jnp.zeros(3))
     pointing = np.einsum("jab,jb->ja", np.asarray(world), bone_directions(body))
     for side, sign in (("Left", 1), ("Right", -1)):
         for bone in ("Arm", "ForeArm"):
@@ -89,9 +90,9 @@ def test_t_pose_has_level_arms_and_straight_legs(body):
     np.testing.assert_allclose(np.asarray(a_pose), np.asarray(rest[:13380]), atol=2e-6)
 
 
-def test_rigid_motion_of_the_root_moves_everything_rigidly(body):
+def test_rigid_root_motion_moves_all_vertices_rigidly(body):
     turn = Rotation.from_rotvec([0.3, 1.2, -0.4])
-    pose = body.t_pose()
+    pose = t_pose(body)
     turned = pose.at[0].set(jnp.asarray(turn.as_quat(scalar_first=True), jnp.float32))
     shape = body.default_shape()
     a = np.asarray(body(shape, pose, jnp.zeros(3)))
@@ -99,7 +100,7 @@ def test_rigid_motion_of_the_root_moves_everything_rigidly(body):
     np.testing.assert_allclose(b, a @ turn.as_matrix().T + [1, 2, 3], atol=3e-6)
 
 
-def test_vmap_agrees_with_a_loop_and_gradients_with_differences(body):
+def test_vmap_matches_a_loop_and_gradients_match_finite_differences(body):
     rng = np.random.default_rng(1)
     poses = Rotation.from_rotvec(rng.normal(0, 0.3, (3 * 31, 3))).as_quat(scalar_first=True)
     poses = jnp.asarray(poses.reshape(3, 31, 4), jnp.float32)
@@ -137,7 +138,7 @@ def by_hand(parents, heads, pose, root):
     [(-1,), (-1, 0, 1, 2), (-1, 0, 0, 0), (-1, 0, -1, 2, 1, 0), (-1, 0, 1, 1, 0, 4, 5, 2)],
     ids=["one", "chain", "star", "two roots", "tree"],
 )
-def test_any_tree_of_joints_is_followed(parents):
+def test_forward_kinematics_match_numpy_for_any_joint_tree(parents):
     rng = np.random.default_rng(len(parents))
     heads = rng.normal(size=(len(parents), 3)).astype(np.float32)
     pose = rng.normal(size=(len(parents), 4)).astype(np.float32)
@@ -161,7 +162,7 @@ def test_unknown_shape_parameters_are_refused(body):
         body.shape(wieght_up=1.0)
 
 
-def test_what_is_loaded_first_inside_a_traced_function_stays_usable(rest):
+def test_assets_first_loaded_under_jit_contain_no_tracers(rest):
     """Kept by a cache: what belonged to one program would break every other."""
     kept = []
 

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from physxnet_jax.body import clothed_vertices, linear_blend_skinning, register_body
+from physxnet_jax.body import clothed_vertices, linear_blend_skinning, register_body, t_pose
 from physxnet_jax.errors import MeshError
 
 
@@ -16,7 +16,7 @@ def stranger(body):
     """A tall man in T-pose, turned by 130 degrees, of 9,000 triangles."""
     shape = body.shape(gender=1.0, height_up=0.7, muscle_up=0.5)
     rest = body.rest_vertices(shape)
-    world, shift = body.transforms(rest, body.t_pose(shape), jnp.asarray([0.3, 1.0, -0.5]))
+    world, shift = body.transforms(rest, t_pose(body, shape), jnp.asarray([0.3, 1.0, -0.5]))
     n = 13380
     x = np.asarray(linear_blend_skinning(rest[:n], body.weights[:n], world, shift))
     turn = Rotation.from_euler("Y", 130, degrees=True).as_matrix().astype(np.float32)
@@ -27,10 +27,11 @@ def stranger(body):
     return rest, x, vertices.astype(np.float32), faces.astype(np.int32)
 
 
-def test_a_stranger_is_met_vertex_by_vertex(body, stranger):
+@pytest.mark.release
+def test_registration_recovers_another_body_vertex_by_vertex(body, stranger):
     rest, x, vertices, faces = stranger
-    told = []
-    found = register_body(vertices, faces, progress=lambda *at: told.append(at))
+    seen = []
+    found = register_body(vertices, faces, progress=lambda *at: seen.append(at))
     clothed = clothed_vertices(body)
     assert found.sure[clothed].mean() > 0.99 and found.distance[clothed].mean() < 0.008
     error = np.linalg.norm(found.posed - x, axis=1)[clothed]
@@ -48,19 +49,20 @@ def test_a_stranger_is_met_vertex_by_vertex(body, stranger):
     twice = found.carried(np.stack([vertices, 2 * vertices + 1]), faces)
     np.testing.assert_allclose(twice[0], found.posed, atol=1e-6)
     np.testing.assert_allclose(twice[1], 2 * found.posed + 1, atol=1e-5)
-    assert told[-1][1] == told[-1][2] and [t[1] for t in told] == list(range(1, len(told) + 1))
+    assert seen[-1][1] == seen[-1][2] and [t[1] for t in seen] == list(range(1, len(seen) + 1))
 
 
-def test_what_is_no_person_is_refused():
+@pytest.mark.release
+def test_meshes_that_are_not_bodies_are_refused():
     ball = trimesh.creation.icosphere(4, 0.8)
     vertices = np.asarray(ball.vertices, np.float32)
-    with pytest.raises(MeshError, match="can't be laid onto"):
+    with pytest.raises(MeshError, match="can't be registered to"):
         register_body(vertices, np.asarray(ball.faces, np.int32))
     with pytest.raises(MeshError, match="no surface"):
         register_body(np.zeros((3, 3), np.float32), np.array([[0, 1, 2]], np.int32))
 
 
-def test_a_body_with_other_rest_vertices_has_them_whatever_its_shape(body, rest):
+def test_body_with_rest_has_these_vertices_for_every_shape(body, rest):
     moved = rest * jnp.float32(1.1)
     other = body.with_rest(moved)
     for shape in (body.default_shape(), body.shape(gender=1.0, weight_up=0.5)):

@@ -14,9 +14,9 @@ from flax import nnx
 from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
 from physxnet_jax.cli._bench_net import (
-    _as,
     _from_json,
-    _place,
+    _narrow_command,
+    _sort_key,
     _to_json,
     _with_errors,
     _with_evaluated,
@@ -29,12 +29,17 @@ from physxnet_jax.cli._experiment_commands import Bench
 from physxnet_jax.cli._machine import machine
 from physxnet_jax.cli._rows import kept_rows, weights_digest
 from physxnet_jax.data import Sequence
-from physxnet_jax.dressing import Cost, mean_errors, present_devices
-from physxnet_jax.dressing._cost import _first_of_each
-from physxnet_jax.evaluation import skinning
+from physxnet_jax.evaluation import Cost, mean_errors, present_devices, skinning
+from physxnet_jax.evaluation._cost import _first_of_each
 from physxnet_jax.garment import TEMPLATES, template
-from physxnet_jax.io import save_predictor
-from physxnet_jax.models import ModelConfig, Normalisation, Predictor, make_generator, make_surface
+from physxnet_jax.models import (
+    ModelConfig,
+    Normalisation,
+    Predictor,
+    make_generator,
+    make_texel_points,
+    save_predictor,
+)
 from physxnet_jax.motion import Motion, load_motion
 from physxnet_jax.uv import garment_map_rows, make_atlas
 
@@ -52,7 +57,7 @@ def tiny(tmp_path_factory):
     graph, state = nnx.split(network)
     one = jnp.ones(())
     scales = Normalisation(one, one, {t: 0.01 * one for t in TEMPLATES})
-    surface = make_surface(atlas, body, rest, valid)
+    surface = make_texel_points(atlas, body, rest, valid)
     folder = tmp_path_factory.mktemp("weights") / "tiny"
     save_predictor(folder, Predictor(atlas, surface, scales, state, graph, config), name="tiny")
     return folder
@@ -60,17 +65,17 @@ def tiny(tmp_path_factory):
 
 @pytest.fixture
 def hasty(monkeypatch):
-    monkeypatch.setattr("physxnet_jax.dressing._cost._SECONDS", 0.05)
-    monkeypatch.setattr("physxnet_jax.dressing._cost._TIMES", 3)
+    monkeypatch.setattr("physxnet_jax.evaluation._cost._SECONDS", 0.05)
+    monkeypatch.setattr("physxnet_jax.evaluation._cost._MIN_CALLS", 3)
     freed = []
     # Other tests go on with what is compiled.
     monkeypatch.setattr(jax, "clear_caches", lambda: freed.append(True))
     return freed
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("hasty")
-def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys):
+def test_rows_are_complete_and_measured_once(tiny, tmp_path, capsys):
     out = tmp_path / "net.json"
     words = ["bench", "net", "--weights", str(tiny), "--batches", "1", "--garments", "1", "2"]
     assert main([*words[:-2], "2", "--out", str(out), "--quiet"]) == 0
@@ -108,9 +113,10 @@ def test_rows_are_whole_and_measured_once(tiny, tmp_path, capsys):
     assert (tmp_path / "net.md").is_file() and (tmp_path / "net.png").is_file()
 
 
+@pytest.mark.release
 @pytest.mark.usefixtures("hasty")
-def test_errors_that_were_evaluated_are_taken_over(tiny, tmp_path):
-    told = [
+def test_evaluated_errors_are_copied_to_the_rows(tiny, tmp_path):
+    error_rows = [
         {"engine": engine, "method": m, "template": t, "rmse_vertices_mm": mm + k}
         for engine, mm in (("physxnet", 10.0), ("blender", 90.0))
         for m, more in (("lbs", 0.0), (str(tiny), 1.0), (f"{tiny}+push", 2.0))
@@ -118,7 +124,7 @@ def test_errors_that_were_evaluated_are_taken_over(tiny, tmp_path):
         for k in (more, more + 2.0)
     ]
     rows, out = tmp_path / "rows.json", tmp_path / "net.json"
-    rows.write_text(json.dumps(told))
+    rows.write_text(json.dumps(error_rows))
     words = ["bench", "net", "--weights", str(tiny), "--batches", "1", "--garments", "1", "--quiet"]
     assert main([*words, "--errors", str(rows), "--out", str(out)]) == 0
     found = {
@@ -130,7 +136,8 @@ def test_errors_that_were_evaluated_are_taken_over(tiny, tmp_path):
     assert main([*words, "--errors", str(rows)]) == 2
 
 
-def test_gradients_are_measured_when_asked_for(tiny, tmp_path, hasty):
+@pytest.mark.release
+def test_gradients_are_measured_on_request(tiny, tmp_path, hasty):
     out = tmp_path / "net.json"
     words = ["--weights", str(tiny), "--batches", "3", "--garments", "1", "--backward", "--quiet"]
     assert main(["bench", "net", *words, "--out", str(out)]) == 0
@@ -145,27 +152,27 @@ def test_gradients_are_measured_when_asked_for(tiny, tmp_path, hasty):
     ("words", "says"),
     [
         (["--garments", "4"], "from 1 to 3"),
-        (["--weights", "nano", "runs/nano"], "called the same"),
+        (["--weights", "nano", "runs/nano"], "have the same name"),
         (["--times"], "there are none"),
     ],
 )
-def test_tables_that_would_mislead_are_refused(words, says, capsys):
+def test_options_for_misleading_tables_are_refused(words, says, capsys):
     assert main(["bench", "net", "--weights", "nano", *words]) == 2
     assert says in " ".join(capsys.readouterr().err.split())
 
 
-def test_times_are_taken_of_the_rows_that_are_there():
+def test_times_option_measures_only_existing_rows():
     nan = float("nan")
     known = [
         Cost("network", "nano", "cpu", batch, g, nan, 1.0, 0.5, 1.0, 9, nan, 0.1, nan, slope)
         for batch, g, slope in ((1, 2, nan), (32, 2, 4.0), (1, 3, nan))
     ]
-    again = _as(Bench("net", garments=(1,), batches=(8,)), known)
+    again = _narrow_command(Bench("net", garments=(1,), batches=(8,)), known)
     assert (again.garments, again.batches, again.backward) == ((2, 3), (1, 32), True)
-    assert not _as(Bench("net"), known[:1]).backward
+    assert not _narrow_command(Bench("net"), known[:1]).backward
 
 
-def test_mean_errors_are_those_of_the_actions():
+def test_mean_errors_average_the_finite_actions():
     walk = load_motion("walk", fps=30.0)
     motion = Motion(walk.rotations[:3], walk.root[:3], 30.0)
     shift = np.zeros((3, 2726, 3), np.float32)
@@ -182,7 +189,7 @@ def test_mean_errors_are_those_of_the_actions():
     assert found["bottom"] == pytest.approx(4.0, rel=1e-3)
 
 
-def test_panels_are_numbers_of_garments_and_lines_run_through_sizes():
+def test_plots_have_a_panel_per_garment_count_and_a_line_over_sizes():
     nan = float("nan")
 
     def row(method, size, batch, garments, error):
@@ -200,12 +207,12 @@ def test_panels_are_numbers_of_garments_and_lines_run_through_sizes():
     low = [dataclasses.replace(r, precision="bfloat16") for r in rows]
     assert points(low)[-1][1] == "network bfloat16, 32 frames"
     assert len(points(rows[:3])) == 3, "without networks every number is shown"
-    noisy = [*rows, *(row("simulator", s, 1, 3, 6.0) for s in ("draft", "noise"))]
+    noisy = [*rows, *(row("simulator", s, 1, 3, 6.0) for s in ("draft", "perturbed"))]
     assert [p[1] for p in points(noisy)].count("simulator") == 1, "noise is a floor, no point"
     assert floors(noisy) == {"3 garments": 6.0} and floors(rows) == {}
 
 
-def test_rows_of_another_machine_or_of_other_weights_are_not_gone_on_with(tmp_path, capsys):
+def test_rows_of_another_machine_or_other_weights_are_not_resumed(tmp_path, capsys):
     nan = float("nan")
     row = Cost("network", "nano", "cpu", 1, 1, nan, 1.0, 0.5, 1.0, 9, nan, 0.1, nan)
     digest = weights_digest("nano")
@@ -239,23 +246,23 @@ def test_rows_of_another_machine_or_of_other_weights_are_not_gone_on_with(tmp_pa
         ["evaluate", "lbs", "--data", "none", "--out", "/proc/a.json"],
         ["stress", "--out", "/proc/a.json"],
         ["effects", "walk", "--out", "/proc/a.json"],
-        ["dataset", "check", "none", "--sheet", "/proc/a.png"],
+        ["dataset", "check", "none", "--contact-sheet", "/proc/a.png"],
     ],
     ids=lambda words: "-".join(words[:2]),
 )
-def test_where_nothing_can_be_written_is_told_before_the_work(words, capsys):
+def test_unwritable_outputs_are_refused_before_the_measurement(words, capsys):
     assert main(words) == 2
     assert "nothing can be written there" in " ".join(capsys.readouterr().err.split())
 
 
-def test_what_is_missing_is_said(tmp_path, capsys):
+def test_missing_actions_and_weights_are_reported(tmp_path, capsys):
     assert main(["bench", "net", "--data", str(tmp_path)]) == 2
     assert "no 'test' actions" in capsys.readouterr().err
     assert main(["bench", "net", "--weights", "none", "--out", str(tmp_path / "a.json")]) == 2
     assert "none" in capsys.readouterr().err
 
 
-def test_an_engine_is_timed_and_drawn_without_an_error():
+def test_engines_are_timed_and_plotted_without_an_error():
     nan = float("nan")
 
     def row(method, size, garments, error, **more):
@@ -277,13 +284,18 @@ def test_an_engine_is_timed_and_drawn_without_an_error():
     assert [p[1] for p in points(rows)] == ["network, live"]
     # Whichever was measured first, the table has one order.
     rows += [row("network", "local", 1, 9.0, params=99), row("lbs", "-", 1, 20.0)]
-    placed = [r.size for r in sorted(rows, key=_place)]
+    placed = [r.size for r in sorted(rows, key=_sort_key)]
     assert placed == ["-", "blender", "blender", "blender", "small", "local"]
-    solved = [row("simulator", a, 1, 9.0) for a in ("standard", "fine", "noise", "draft")]
-    assert [r.size for r in sorted(solved, key=_place)] == ["noise", "draft", "standard", "fine"]
+    solved = [row("simulator", a, 1, 9.0) for a in ("standard", "fine", "perturbed", "draft")]
+    assert [r.size for r in sorted(solved, key=_sort_key)] == [
+        "perturbed",
+        "draft",
+        "standard",
+        "fine",
+    ]
 
 
-def test_rows_of_several_devices_stand_side_by_side():
+def test_rows_of_several_devices_share_one_table():
     nan = float("nan")
     rows = [
         Cost("network", "small", d, b, 1, 9.0, ms, 0.5, 1.0, 9, nan, 0.1, nan)
@@ -301,14 +313,14 @@ def test_rows_of_several_devices_stand_side_by_side():
     assert "device" not in markdown(rows[:2]) and points(rows[:2])[0][1] == "network, live"
 
 
-def test_every_kind_of_device_is_measured_once():
+def test_each_device_kind_is_measured_once():
     cpu, card, second = (types.SimpleNamespace(device_kind=k) for k in ("cpu", "H100", "H100"))
     assert _first_of_each([card, second, cpu]) == [card, cpu]
     assert _first_of_each([cpu, cpu]) == [cpu]
     assert jax.devices("cpu")[0] in present_devices()
 
 
-def test_rows_take_the_errors_that_were_evaluated_since(tmp_path):
+def test_rows_take_errors_that_were_evaluated_later(tmp_path):
     nan = float("nan")
 
     def row(method, size, garments, **more):
@@ -337,7 +349,7 @@ def test_rows_take_the_errors_that_were_evaluated_since(tmp_path):
         assert _with_evaluated(other, found) == other
 
 
-def test_a_row_timed_again_has_the_errors_of_its_garments():
+def test_retimed_rows_keep_the_errors_of_their_garments():
     nan = float("nan")
 
     def row(method, garments, error, each):

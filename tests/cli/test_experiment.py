@@ -11,44 +11,54 @@ from physxnet_jax.dressing import EXPORTED
 from physxnet_jax.motion import load_motion, save_motion
 
 DATASET = """
-from physxnet_jax.data import DatasetConfig
-from physxnet_jax.simulation import XPBD
-CONFIG = DatasetConfig(
-    splits=("train",), templates=("bottom",), exaggerate=1.1, solver=XPBD(8, 1)
-)
+[small]
+splits = ["train"]
+templates = ["bottom"]
+solver = { substeps = 8, contact_updates = 1 }
+
+[set]
+base = "small"
+exaggerate = 1.1
 """
 TRAIN = """
-from physxnet_jax.models import Inputs, ModelConfig
-from physxnet_jax.training import TrainConfig
-CONFIG = TrainConfig(
-    model=ModelConfig(Inputs(), resolution=32, width=4, templates=("bottom",)),
-    epochs=2, batch=4, adversarial=False,
-)
+model = { resolution = 32, width = 4, templates = ["bottom"] }
+epochs = 2
+batch = 4
+adversarial = false
 """
 
 
+@pytest.mark.release
 def test_build_train_evaluate(tmp_path, capsys):
     mocap = str(tmp_path / "mocap")
     save_motion(tmp_path / "mocap/a.npz", load_motion("punch", fps=30))
     (tmp_path / "mocap/ACTIONS.csv").write_text(
         "split,action,file,start_s,frames_at_30fps\ntrain,run,a.npz,0.0,34\ntest,on,a.npz,2,30\n"
     )
-    for name, text in (("dataset.py", DATASET), ("tiny.py", TRAIN)):
+    for name, text in (("dataset.toml", DATASET), ("tiny.toml", TRAIN)):
         (tmp_path / name).write_text(text)
     root, run, out = (str(tmp_path / n) for n in ("set", "run", "errors.json"))
-    build = ["dataset", "build", str(tmp_path / "dataset.py"), "--out", root, "--mocap", mocap]
+    build = [
+        "dataset",
+        "build",
+        f"{tmp_path / 'dataset.toml'}#set",
+        "--out",
+        root,
+        "--mocap",
+        mocap,
+    ]
     assert main([*build, "--only", "run", "--json"]) == 0
     assert len(list_sequences(root)) == 1 and len(read_log(root)) == 1
-    told = json.loads(capsys.readouterr().out)
-    assert told["simulated"] == 1 and (told["sha256"], told["bytes"]) == dataset_digest(root)
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["simulated"] == 1 and (shown["sha256"], shown["bytes"]) == dataset_digest(root)
     sheet = tmp_path / "sheet.png"
-    check = ["dataset", "check", root, "--mocap", mocap, "--json", "--sheet", str(sheet)]
+    check = ["dataset", "check", root, "--mocap", mocap, "--json", "--contact-sheet", str(sheet)]
     capsys.readouterr()
     assert main(check) in (0, 1)
     rows = json.loads(capsys.readouterr().out)["rows"]
     assert {r["quantity"] for r in rows} >= {"frames missing", "largest offset, m"}
     assert sheet.stat().st_size > 1000
-    train = ["train", str(tmp_path / "tiny.py"), "--data", root, "--out", run, "--steps", "2"]
+    train = ["train", str(tmp_path / "tiny.toml"), "--data", root, "--out", run, "--steps", "2"]
     assert main([*train, "--quiet"]) == 0
     card = json.loads((tmp_path / "run/weights/card.json").read_text())
     assert card["name"] == "tiny" and card["training"]["frames"] == 34
@@ -93,14 +103,14 @@ def test_build_train_evaluate(tmp_path, capsys):
     for broken in ("{", "[1]", '[{"method": "lbs"}]'):
         (tmp_path / "old.json").write_text(broken)
         assert main([*measure[:-1], str(tmp_path / "old.json"), "--quiet"]) == 2
-        assert "not rows that this command can go on from" in capsys.readouterr().err
+        assert "not rows that this command can resume from" in capsys.readouterr().err
     # Whose rows are all there needn't be.
     shutil.rmtree(run)
     assert main([*measure, "--quiet"]) == 0
     assert main([*measure[:-1], str(tmp_path / "anew.json"), "--quiet"]) == 2
     capsys.readouterr()
     assert main(["evaluate", run, "elsewhere/run", "--data", root, "--split", "train"]) != 0
-    assert "two methods are called run" in capsys.readouterr().err
+    assert "two methods are named run" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -113,23 +123,34 @@ def test_build_train_evaluate(tmp_path, capsys):
         (["evaluate", "lbs", "--data", "nowhere", "--out", "x.csv"], ".json"),
     ],
 )
-def test_what_is_missing_is_said_in_one_line(words, said, capsys):
+def test_missing_inputs_are_reported_in_one_line(words, said, capsys):
     assert main(words) == 2
     assert said in " ".join(capsys.readouterr().err.split())
 
 
-def test_a_configuration_that_is_none_is_refused(tmp_path, capsys):
-    path = tmp_path / "config.py"
-    for text, said in (("x = 1", "expected CONFIG"), ("1 / 0", "ZeroDivisionError")):
+def test_invalid_configurations_are_refused(tmp_path, capsys):
+    path = tmp_path / "config.toml"
+    wrong = (
+        ("x = 1", "unknown key 'x'"),
+        ("1 / 0", "not TOML"),
+        ("epochs = 1.5", "expected int"),
+        ("schedule = 'steep'", "expected constant, cosine"),
+        ("model = { width = 'wide' }", "width is 'wide'"),
+    )
+    for text, said in wrong:
         path.write_text(text)
         assert main(["train", str(path), "--data", "x", "--out", str(tmp_path / "run")]) == 2
         assert said in " ".join(capsys.readouterr().err.split())
     path.write_text(DATASET)
-    assert main(["dataset", "build", str(path), "--out", "x", "--shard", "2/2"]) == 2
+    assert main(["dataset", "build", f"{path}#set", "--out", "x", "--shard", "2/2"]) == 2
     assert "0 <= i < n" in capsys.readouterr().err
+    for name, said in (("none", "there are small, set"), ("loop", "form a cycle")):
+        path.write_text(DATASET + '[loop]\nbase = "loop"\n' if name == "loop" else DATASET)
+        assert main(["dataset", "build", f"{path}#{name}", "--out", "x"]) == 2
+        assert said in " ".join(capsys.readouterr().err.split())
 
 
-def test_clothes_are_exported_by_a_command(tmp_path, capsys):
+def test_export_command_writes_a_dresser(tmp_path, capsys):
     pytest.importorskip("flatbuffers")
     out = tmp_path / "dresser"
     assert main(["export", "--wear", "bottom", "--out", str(out), "--platforms", "cpu"]) == 0

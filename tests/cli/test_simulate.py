@@ -11,7 +11,7 @@ import pytest
 
 from physxnet_jax.cli import main
 from physxnet_jax.cli._progress import print_json
-from physxnet_jax.dressing import load_scene, make_dresser, make_scene
+from physxnet_jax.dressing import Inference, Simulation, load_scene, make_dresser, make_scene
 from physxnet_jax.errors import (
     MissingDependencyError,
     MotionError,
@@ -22,21 +22,9 @@ from physxnet_jax.evaluation import price_effects, recommend_effects
 from physxnet_jax.garment import square_sheet, template
 from physxnet_jax.io import write_obj
 from physxnet_jax.motion import body_animation, load_motion
-from physxnet_jax.simulation import (
-    XPBD,
-    Air,
-    BodyContact,
-    Effect,
-    Gravity,
-    LayerContact,
-    Pin,
-    Rollout,
-    Scene,
-    Stretch,
-    prepare_scene,
-    simulate_batch,
-)
+from physxnet_jax.simulation import XPBD, Effect, Rollout, Scene, prepare_scene, simulate_batch
 from physxnet_jax.simulation.blender import find_blender
+from physxnet_jax.simulation.effects import Air, BodyContact, Gravity, LayerContact, Pin, Stretch
 
 TOML = """
 motion = "balance"
@@ -50,20 +38,22 @@ wind = [0, 0, 4]
 """
 
 
-def test_a_scene_file_is_simulated_and_written(tmp_path, capsys):
+@pytest.mark.release
+def test_scene_files_are_simulated_and_written(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
     scene.write_text(TOML)
     out = tmp_path / "a.npz"
     assert main(["simulate", str(scene), "-o", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "Air" in said and "deepest in the skin" in said
+    assert "Air" in said and "deepest penetration of the skin" in said
     with np.load(out) as data:
         assert data["bottom_positions"].shape == (4, 2726, 3)
         assert np.isfinite(data["bottom_positions"]).all()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "scene.toml"]
 
 
-def test_of_a_scene_file_frames_alone_can_be_told_otherwise(tmp_path, capsys):
+@pytest.mark.release
+def test_only_frames_can_override_a_scene_file(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
     scene.write_text(TOML)
     out = tmp_path / "a.npz"
@@ -79,7 +69,7 @@ def test_of_a_scene_file_frames_alone_can_be_told_otherwise(tmp_path, capsys):
     assert "leave --wear out" in " ".join(capsys.readouterr().err.split())
 
 
-def test_scene_files_say_what_they_hold(tmp_path):
+def test_scene_files_define_garments_effects_and_motion(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(TOML)
     job = load_scene(path)
@@ -94,16 +84,20 @@ def test_scene_files_say_what_they_hold(tmp_path):
 
 
 class Sway(Effect):
-    """An effect of somebody's own."""
+    """A custom effect."""
 
 
-def test_a_scene_keeps_effects_of_ones_own_and_nothing_twice():
+def test_scenes_keep_custom_effects_and_refuse_duplicates():
     wind = Air(wind=(0.0, 0.0, 4.0))
-    scene = make_scene("walk", "bottom", effects=[Pin(), Sway(), Gravity(), wind]).scene
+    scene = make_scene(
+        "walk", "bottom", simulation=Simulation(effects=(Pin(), Sway(), Gravity(), wind))
+    ).scene
     assert [type(e) for e in scene.effects] == [Gravity, Air, Sway, Pin]
     calm = Air(wind=(0.0, 0.0, 0.0))
-    assert make_scene("walk", "bottom", effects=[wind], also=[calm]).scene.effects == (calm,)
-    twice = make_scene("walk", "bottom", effects=[wind, calm]).scene
+    assert make_scene(
+        "walk", "bottom", simulation=Simulation(effects=(wind,)), also=[calm]
+    ).scene.effects == (calm,)
+    twice = make_scene("walk", "bottom", simulation=Simulation(effects=(wind, calm))).scene
     with pytest.raises(SimulationError, match="listed twice"):
         prepare_scene(twice)
 
@@ -117,32 +111,33 @@ def test_a_scene_keeps_effects_of_ones_own_and_nothing_twice():
         ["--engine", "bdf2", "--accuracy", "fine"],
     ],
 )
-def test_what_an_engine_would_leave_out_is_refused(words, capsys):
+def test_options_an_engine_cannot_apply_are_refused(words, capsys):
     assert main(["simulate", "walk", "--wear", "bottom", *words]) == 2
     assert "leave" in capsys.readouterr().err
 
 
-def test_a_mesh_of_a_file_beside_a_scene_is_found(tmp_path, monkeypatch):
+def test_garment_paths_resolve_relative_to_the_scene_file(tmp_path, monkeypatch):
     mesh = template("bottom").mesh
     (tmp_path / "in").mkdir()
     write_obj(tmp_path / "in/a.obj", np.asarray(mesh.vertices), np.asarray(mesh.faces))
     text = (tmp_path / "in/a.obj").read_text()
     (tmp_path / "in/a.obj").write_text(text.replace("\nf ", "\no legs\nf ", 1))
     monkeypatch.chdir(tmp_path)
-    for word in ("a.obj", "a.obj#legs", "a.obj=bottom", "a.obj#legs=bottom"):
+    for word in ("a.obj", "a.obj#legs", "a.obj:as=bottom", "a.obj#legs:as=bottom"):
         (tmp_path / "in/s.toml").write_text(f'motion = "walk"\ngarments = ["{word}"]\n')
         (garment,) = load_scene(tmp_path / "in/s.toml", frames=2).scene.garments
         assert garment.template == "bottom"
 
 
-def test_what_dress_tells_of_a_garment_file_is_told_here_too(tmp_path, capsys):
+@pytest.mark.release
+def test_notes_of_garment_files_match_dress(tmp_path, capsys):
     mesh = template("bottom").mesh
     vertices = np.array(mesh.vertices)
     # Caught on a nail: its edges are too long to fold.
     vertices[np.argmax(vertices[:, 2])] += [0.0, 0.0, 0.08]
     write_obj(tmp_path / "caught.obj", vertices, np.asarray(mesh.faces))
     scene = tmp_path / "scene.toml"
-    scene.write_text(TOML.replace('"bottom"', '"caught.obj=bottom"'))
+    scene.write_text(TOML.replace('"bottom"', '"caught.obj:as=bottom"'))
     (note,) = load_scene(scene).notes
     assert "caught.obj" in note and "physxnet" in note
     assert load_scene(scene).scene.garments[0].fabric.density == 0.07, "the fabric is the scene's"
@@ -151,12 +146,17 @@ def test_what_dress_tells_of_a_garment_file_is_told_here_too(tmp_path, capsys):
     assert main(["simulate", str(scene), "--frames", "2", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["notes"] == [note]
     assert not make_scene("walk", ["bottom"]).notes
-    (told,) = make_dresser([f"{tmp_path / 'caught.obj'}=bottom"], weights="nano").notes
+    (told,) = make_dresser(
+        [f"{tmp_path / 'caught.obj'}:as=bottom"],
+        inference=Inference(weights="nano", strain_iterations=0),
+    ).notes
     assert told == note
-    assert not make_dresser(["bottom"], weights="nano").notes
+    assert not make_dresser(
+        ["bottom"], inference=Inference(weights="nano", strain_iterations=0)
+    ).notes
 
 
-def test_a_folder_of_other_things_is_neither_used_nor_removed(tmp_path):
+def test_resume_folder_with_other_files_is_neither_used_nor_removed(tmp_path):
     scene = prepare_scene(
         Scene((square_sheet(5, pinned=np.arange(5)),), (Gravity(), Stretch(), Pin()))
     )
@@ -164,7 +164,7 @@ def test_a_folder_of_other_things_is_neither_used_nor_removed(tmp_path):
     theirs = tmp_path / "results"
     theirs.mkdir()
     (theirs / "thesis.txt").write_text("years")
-    with pytest.raises(SimulationError, match="no rollout's"):
+    with pytest.raises(SimulationError, match="don't belong to a rollout"):
         simulate_batch(scene, [motion], solver=XPBD(8, 2), resume=theirs)
     assert [p.name for p in theirs.iterdir()] == ["thesis.txt"]
     keep = tmp_path / "keep"
@@ -176,7 +176,7 @@ def test_a_folder_of_other_things_is_neither_used_nor_removed(tmp_path):
     assert [p.name for p in keep.iterdir()] == ["notes.txt"]
 
 
-def test_a_motion_is_simulated_at_the_rate_that_is_asked_for():
+def test_motions_are_simulated_at_the_requested_rate():
     walk = load_motion("walk", fps=60.0)
     assert make_scene(walk, ["bottom"]).motion.fps == 60.0
     half = make_scene(walk, ["bottom"], fps=30.0).motion
@@ -217,7 +217,7 @@ def test_wrong_scene_files_are_refused_with_a_fix(tmp_path, text, says):
         load_scene(path)
 
 
-def test_a_stopped_rollout_goes_on_and_ends_the_same(tmp_path):
+def test_resumed_rollout_matches_an_uninterrupted_one(tmp_path):
     scene = prepare_scene(
         Scene((square_sheet(5, pinned=np.arange(5)),), (Gravity(), Stretch(), Pin()))
     )
@@ -257,8 +257,8 @@ def test_a_stopped_rollout_goes_on_and_ends_the_same(tmp_path):
     assert not keep.exists()
 
 
-@pytest.mark.slow
-def test_the_price_list_tells_effects_that_matter_from_those_that_do_not(tmp_path, capsys):
+@pytest.mark.nightly
+def test_effect_costs_separate_relevant_from_irrelevant_effects(tmp_path, capsys):
     # A sheet pinned to the hips a metre and a half before the body: no contact, little air.
     g = square_sheet(5, pinned=np.arange(5))
     motion = load_motion("balance", fps=30.0)
@@ -278,7 +278,8 @@ def test_the_price_list_tells_effects_that_matter_from_those_that_do_not(tmp_pat
     assert not advice["SelfContact"].needed and "never comes nearer" in advice["SelfContact"].why
 
 
-def test_effects_prints_its_table(tmp_path, capsys, monkeypatch):
+@pytest.mark.release
+def test_effects_command_prints_and_writes_its_table(tmp_path, capsys, monkeypatch):
     path, rows = tmp_path / "scene.toml", tmp_path / "rows.json"
     path.write_text(
         'motion = "balance"\nframes = 2\naccuracy = "draft"\ngarments = ["bottom"]\n'
@@ -290,7 +291,7 @@ def test_effects_prints_its_table(tmp_path, capsys, monkeypatch):
         measured[:] = measured or price_effects(*words, **more)
         return measured
 
-    monkeypatch.setattr("physxnet_jax.cli._simulate.price_effects", price)
+    monkeypatch.setattr("physxnet_jax.cli._effects.price_effects", price)
     assert main(["effects", str(path), "-o", str(rows)]) == 0
     said = capsys.readouterr().out
     assert "BodyContact" in said and "inside" in said
@@ -301,16 +302,17 @@ def test_effects_prints_its_table(tmp_path, capsys, monkeypatch):
     assert json.loads(capsys.readouterr().out)["effects"] == data
 
 
-def test_without_blender_the_way_to_it_is_told(monkeypatch):
+def test_missing_blender_error_names_the_environment_variable(monkeypatch):
     monkeypatch.setenv("PHYSXNET_BLENDER", "/nowhere/blender")
     with pytest.raises(MissingDependencyError, match="PHYSXNET_BLENDER"):
         find_blender()
 
 
-def test_a_rollout_has_one_name_in_every_process():
+@pytest.mark.release
+def test_rollout_fingerprint_is_equal_across_processes():
     """What is kept is found again by the next process, whose memory lies elsewhere."""
     code = (
-        "from physxnet_jax.simulation import ACCURACY, Scene, prepare_scene, XPBD\n"
+        "from physxnet_jax.simulation import PRESETS, Scene, prepare_scene, XPBD\n"
         "from physxnet_jax.simulation._resume import fingerprint\n"
         "from physxnet_jax.garment import template\n"
         "pad = [object() for _ in range({pad})]\n"
@@ -328,7 +330,7 @@ def test_a_rollout_has_one_name_in_every_process():
     assert name(0, steps=16) != first
 
 
-def test_a_loaded_motion_stands_on_the_floor_whatever_the_shape(body):
+def test_loaded_motion_stands_on_the_floor_for_other_shapes(body):
     clip = load_motion("walk", fps=30)
     tall = body.shape(height_up=1.0)
     low = []
@@ -342,13 +344,13 @@ def test_a_loaded_motion_stands_on_the_floor_whatever_the_shape(body):
 
 
 @pytest.mark.parametrize("word", ["source_fps", "skeleton", "joint_map"])
-def test_what_is_for_files_is_refused_for_a_loaded_motion(word):
+def test_file_options_are_refused_for_a_loaded_motion(word):
     value = 60.0 if word == "source_fps" else "a.asf"
     with pytest.raises(MotionError, match=f"{word} is for motion files"):
         make_scene(load_motion("walk", fps=30), ["top"], **{word: value})
 
 
-def test_what_machines_read_is_json_whatever_was_measured(capsys):
+def test_json_output_is_valid_for_non_finite_values(capsys):
     print_json({"gap": np.inf, "x": [1.0, float("nan")], "path": pathlib.Path("a")})
     told = json.loads(capsys.readouterr().out, parse_constant=lambda c: pytest.fail(c))
     assert told == {"gap": None, "x": [1.0, None], "path": "a"}

@@ -13,7 +13,7 @@ FIELD = np.array([[0.1, 0.2, -0.1], [0.0, 0.1, 0.3], [0.2, -0.2, 0.1]])
 
 
 @pytest.mark.parametrize("name", TEMPLATES)
-def test_a_linear_field_is_mirrored_in_closed_form(name):
+def test_mirrored_linear_field_matches_the_closed_form(name):
     """Offsets A x at x become F A F x: blending corners is exact for what is linear."""
     rest = np.asarray(template(name).mesh.vertices, np.float64)
     told = np.float32(np.stack([rest @ FIELD.T, -2.0 * rest @ FIELD.T]))

@@ -17,6 +17,7 @@ from physxnet_jax.data import (
     build_dataset,
     dataset_digest,
     expected_frames,
+    is_trainable,
     left_out,
     list_sequences,
     load_action,
@@ -25,6 +26,7 @@ from physxnet_jax.data import (
     read_log,
     read_protocol,
     read_sequence,
+    usable_garment,
     write_action,
     write_garment,
     write_offsets,
@@ -36,7 +38,6 @@ from physxnet_jax.evaluation import skinning
 from physxnet_jax.garment import square_sheet, template
 from physxnet_jax.motion import load_motion, make_motion, save_motion
 from physxnet_jax.simulation import XPBD, Rollout, Scene, prepare_scene
-from physxnet_jax.training import teaches, usable_garment
 
 
 def stored(root, frames=70, seed=0):
@@ -52,7 +53,7 @@ def stored(root, frames=70, seed=0):
     return folder, (wave + noise).astype(np.float32)
 
 
-def test_offsets_round_trip_within_a_twentieth_of_a_millimetre(tmp_path):
+def test_offsets_round_trip_within_half_a_quantization_step(tmp_path):
     folder, offsets = stored(tmp_path)
     write_offsets(folder, "top", offsets, {"finite": True, "engine": "test"})
     s = read_sequence(folder)
@@ -62,7 +63,7 @@ def test_offsets_round_trip_within_a_twentieth_of_a_millimetre(tmp_path):
     assert list_sequences(tmp_path, "train") == [folder] and not list_sequences(tmp_path, "test")
 
 
-def test_what_neighbours_foretell_takes_little_room(tmp_path):
+def test_predictive_coding_compresses_smooth_offsets(tmp_path):
     """The wave costs little more than half of what its plain numbers cost, noise included."""
     folder, offsets = stored(tmp_path)
     write_offsets(folder, "top", offsets, {})
@@ -73,21 +74,21 @@ def test_what_neighbours_foretell_takes_little_room(tmp_path):
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 6), st.integers(0, 15))
-def test_the_codec_loses_nothing_whatever_the_numbers(seed, frames, bits):
+def test_codec_is_lossless_for_arbitrary_integers(seed, frames, bits):
     sheet = square_sheet(5)
     codec = make_codec(np.asarray(sheet.mesh.vertices), np.asarray(sheet.mesh.faces))
     values = np.random.default_rng(seed).integers(-(2**bits), 2**bits, (frames, 25, 3))
     np.testing.assert_array_equal(codec.decode(codec.encode(values)), values)
 
 
-def test_the_codec_takes_loose_vertices_and_needles():
+def test_codec_handles_unused_vertices_and_degenerate_triangles():
     x = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 0], [0, 1e-9, 0], [5, 5, 5.0]])
     codec = make_codec(x, np.array([[0, 1, 2], [0, 1, 3]]))
     values = np.random.default_rng(0).integers(-32000, 32000, (4, 5, 3))
     np.testing.assert_array_equal(codec.decode(codec.encode(values)), values)
 
 
-def test_a_dataset_is_the_same_bytes_again_and_damage_is_seen(tmp_path):
+def test_datasets_are_byte_reproducible_and_damage_is_detected(tmp_path):
     digests = []
     for name in ("a", "b"):
         folder, offsets = stored(tmp_path / name)
@@ -103,7 +104,7 @@ def test_a_dataset_is_the_same_bytes_again_and_damage_is_seen(tmp_path):
         read_sequence(folder)
 
 
-def test_what_is_being_written_is_not_there_yet(tmp_path):
+def test_partially_written_garments_are_ignored(tmp_path):
     folder, offsets = stored(tmp_path)
     write_offsets(folder, "top", offsets, {"finite": True})
     digest = dataset_digest(tmp_path)
@@ -114,7 +115,7 @@ def test_what_is_being_written_is_not_there_yet(tmp_path):
     assert dataset_digest(tmp_path) == digest
 
 
-def test_garments_stay_with_the_motion_that_they_were_simulated_on(tmp_path):
+def test_stored_actions_refuse_another_motion(tmp_path):
     folder, _ = stored(tmp_path)
     walk = load_motion("walk")
     write_action(folder, walk, "train")
@@ -125,7 +126,7 @@ def test_garments_stay_with_the_motion_that_they_were_simulated_on(tmp_path):
     np.testing.assert_array_equal(read_sequence(folder).motion.root, walk.root)
 
 
-def test_explosions_are_refused_and_leave_nothing(tmp_path):
+def test_exploded_offsets_are_refused_and_leave_no_files(tmp_path):
     folder, offsets = stored(tmp_path)
     for bad in (np.full_like(offsets, 9.0), np.full_like(offsets, np.nan)):
         with pytest.raises(FormatError, match=r"3\.2 m"):
@@ -135,7 +136,8 @@ def test_explosions_are_refused_and_leave_nothing(tmp_path):
         read_sequence(tmp_path)
 
 
-def test_a_build_goes_on_where_it_was_and_is_another_with_another_solver(data_dir, tmp_path):
+@pytest.mark.release
+def test_builds_resume_and_refuse_another_solver(data_dir, tmp_path):
     config = DatasetConfig(templates=("bottom",), solver=XPBD(8, 1))
     build = functools.partial(
         build_dataset, root=tmp_path, folder=data_dir / "mocap", only=("run",)
@@ -156,7 +158,7 @@ def test_a_build_goes_on_where_it_was_and_is_another_with_another_solver(data_di
         build(DatasetConfig(templates=("bottom",), solver=XPBD(16, 1)))
 
 
-def test_what_networks_answer_is_stored_as_a_dataset(data_dir, tmp_path):
+def test_network_predictions_are_stored_as_a_dataset(data_dir, tmp_path):
     networks = DatasetConfig(
         engine="network", splits=("train",), templates=("bottom",), networks=("local", "small")
     )
@@ -168,9 +170,9 @@ def test_what_networks_answer_is_stored_as_a_dataset(data_dir, tmp_path):
     def ask(motion, name):
         return np.asarray(skinning()(motion, name).positions) + lifted
 
-    with pytest.raises(FormatError, match="what networks answer"):
+    with pytest.raises(FormatError, match="if and only if"):
         build(networks)
-    with pytest.raises(FormatError, match="what networks answer"):
+    with pytest.raises(FormatError, match="if and only if"):
         build(dataclasses.replace(networks, engine="physxnet", networks=()), ask=ask)
     assert build(networks, ask=ask) == 1
     (folder,) = list_sequences(tmp_path)
@@ -178,16 +180,16 @@ def test_what_networks_answer_is_stored_as_a_dataset(data_dir, tmp_path):
     np.testing.assert_allclose(
         told.offsets["bottom"], np.broadcast_to(lifted, told.offsets["bottom"].shape), atol=6e-5
     )
-    assert told.meta["bottom"]["networks"] == ["local", "small"] and teaches(told, "bottom")
+    assert told.meta["bottom"]["networks"] == ["local", "small"] and is_trainable(told, "bottom")
     assert build(networks, ask=lambda *_: pytest.fail("it is there")) == 0
     with pytest.raises(FormatError, match="another configuration"):
         build(dataclasses.replace(networks, networks=("local",)), ask=ask)
     for engine, names in (("network", ()), ("physxnet", ("local",))):
-        with pytest.raises(ValueError, match="name both"):
+        with pytest.raises(ValueError, match="if and only if"):
             DatasetConfig(engine=engine, networks=names)
 
 
-def test_actions_are_changed_as_the_configuration_says(data_dir):
+def test_configuration_augments_the_actions(data_dir):
     body = load_body()
     train = [a for a in read_protocol(data_dir / "mocap") if a.split == "train"]
     last, first = train[-1], train[0]
@@ -205,7 +207,8 @@ def test_actions_are_changed_as_the_configuration_says(data_dir):
     np.testing.assert_allclose(both.root[0] * jnp.array([-1.0, 1.0, 1.0]), plain.root[0], atol=1e-5)
 
 
-def test_what_is_left_of_clips_overlaps_no_action(data_dir):
+@pytest.mark.release
+def test_left_out_frames_overlap_no_action(data_dir):
     actions = read_protocol(data_dir / "mocap")
     rest = left_out(data_dir / "mocap", actions)
     assert {"exercise", "jumps kicks punches", "salsa"} <= {a.name for a in rest}
@@ -219,7 +222,7 @@ def test_what_is_left_of_clips_overlaps_no_action(data_dir):
         assert load_action(data_dir / "mocap", a).num_frames == a.frames
 
 
-def test_a_log_that_a_kill_cut_short_is_gone_on_with(tmp_path):
+def test_truncated_build_log_is_continued(tmp_path):
     for k in range(2):
         log_build(tmp_path, {"k": k})
     log = tmp_path / "build_log.jsonl"
@@ -231,7 +234,7 @@ def test_a_log_that_a_kill_cut_short_is_gone_on_with(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "\xff"])
-def test_a_damaged_note_of_a_dataset_is_told_of(tmp_path, text):
+def test_damaged_dataset_metadata_is_reported(tmp_path, text):
     open_dataset(tmp_path, {"fps": 30})
     open_dataset(tmp_path, {"fps": 30})
     (tmp_path / "dataset.json").write_bytes(text.encode("latin-1"))
@@ -240,7 +243,7 @@ def test_a_damaged_note_of_a_dataset_is_told_of(tmp_path, text):
 
 
 @pytest.mark.parametrize(("left", "speed"), [(False, 1.25), (True, 0.8)])
-def test_a_dataset_knows_how_long_its_actions_are(data_dir, tmp_path, left, speed):
+def test_expected_frames_match_the_built_actions(data_dir, tmp_path, left, speed):
     folder = data_dir / "mocap"
     note = {"splits": ["extra"], "speed": speed} | ({"left_out": True} if left else {})
     open_dataset(tmp_path / "set", note)
@@ -254,7 +257,7 @@ def test_a_dataset_knows_how_long_its_actions_are(data_dir, tmp_path, left, spee
         assert counts[a.name] != a.frames
 
 
-def test_unknown_actions_are_named_before_anything_is_built(data_dir, tmp_path):
+def test_unknown_actions_are_reported_before_the_build(data_dir, tmp_path):
     config = DatasetConfig(templates=("bottom",))
     with pytest.raises(
         FormatError, match="no action 'fly' in the splits train, test; there are: w"
@@ -264,15 +267,15 @@ def test_unknown_actions_are_named_before_anything_is_built(data_dir, tmp_path):
 
 
 @pytest.mark.parametrize("names", [("Jump!", "jump"), ("walk", "\u6b69\u304f")])
-def test_actions_without_a_folder_of_their_own_are_refused(tmp_path, names):
+def test_actions_without_a_unique_folder_name_are_refused(tmp_path, names):
     head = "split,action,file,start_s,frames_at_30fps\n"
     rows = [f"train,{n},a.bvh,0,30\n" for n in names]
     (tmp_path / "ACTIONS.csv").write_text(head + "".join(rows), encoding="utf-8")
-    with pytest.raises(MotionError, match="no folder of its own"):
+    with pytest.raises(MotionError, match="no unique folder name"):
         read_protocol(tmp_path)
 
 
-def test_what_is_left_of_a_clip_begins_after_the_longest_action(tmp_path):
+def test_left_out_frames_begin_after_nested_actions(tmp_path):
     """An action within another: what lies after the inner one is still used, and once."""
     walk = load_motion("walk", fps=30.0)
     turns = np.tile(np.asarray(walk.rotations), (8, 1, 1))[:600]
@@ -286,7 +289,7 @@ def test_what_is_left_of_a_clip_begins_after_the_longest_action(tmp_path):
     assert [(a.name, a.start) for a in found] == [("long", 10.0)]
     # Asked for by itself the other one gets no stretch that isn't its.
     config = DatasetConfig(splits=("train",), templates=("bottom",), left_out=True)
-    with pytest.raises(FormatError, match="leaves nothing out of short"):
+    with pytest.raises(FormatError, match="left_out selects no frames for short"):
         build_dataset(config, tmp_path / "set", tmp_path, only=("short",))
     assert not (tmp_path / "set").exists()
 
@@ -302,12 +305,12 @@ def test_what_is_left_of_a_clip_begins_after_the_longest_action(tmp_path):
         ({"exaggerate": float("nan")}, "exaggerate is nan"),
     ],
 )
-def test_settings_that_no_dataset_can_have_are_refused(wrong, says):
+def test_invalid_dataset_settings_are_refused(wrong, says):
     with pytest.raises(ValueError, match=says):
         DatasetConfig(**wrong)
 
 
-def test_a_body_of_its_own_upper_half_is_refused(data_dir, tmp_path):
+def test_upper_from_that_selects_the_action_itself_is_refused(data_dir, tmp_path):
     for number in (12, 24):
         config = DatasetConfig(splits=("test",), upper_from=number)
         with pytest.raises(FormatError, match="is the action itself"):
@@ -320,7 +323,7 @@ def test_a_body_of_its_own_upper_half_is_refused(data_dir, tmp_path):
     ["train,walk,a.bvh,soon,34", "train,walk,a.bvh", "train,walk,a.bvh,0.0,3.5"],
     ids=["words", "short", "half a frame"],
 )
-def test_a_row_that_is_none_is_named(tmp_path, row):
+def test_invalid_protocol_rows_are_reported_by_line(tmp_path, row):
     head = "split,action,file,start_s,frames_at_30fps"
     (tmp_path / "ACTIONS.csv").write_text(f"{head}\ntrain,run,b.bvh,0.0,30\n{row}\n")
     with pytest.raises(MotionError, match=r"ACTIONS\.csv:3: not a row"):
@@ -330,12 +333,12 @@ def test_a_row_that_is_none_is_named(tmp_path, row):
         read_protocol(tmp_path)
 
 
-def test_a_missing_protocol_is_named(tmp_path):
+def test_missing_protocol_file_is_reported(tmp_path):
     with pytest.raises(MotionError, match=r"ACTIONS\.csv"):
         read_protocol(tmp_path)
 
 
-def test_what_is_damaged_is_named_and_so_is_what_does_not_belong(tmp_path):
+def test_damaged_and_mismatched_files_are_reported(tmp_path):
     folder, offsets = stored(tmp_path)
     write_offsets(folder, "top", offsets, {})
     motion = load_motion("walk")
@@ -369,7 +372,7 @@ def test_what_is_damaged_is_named_and_so_is_what_does_not_belong(tmp_path):
         list_sequences(tmp_path, "train")
 
 
-def test_an_action_ends_with_its_clip(tmp_path):
+def test_actions_that_exceed_their_clip_are_refused(tmp_path):
     save_motion(tmp_path / "a.npz", load_motion("walk", fps=30))  # four seconds
     action = Action("train", "walk", "a.npz", 2.0, 60, None)
     assert load_action(tmp_path, action).num_frames == 60
@@ -378,7 +381,7 @@ def test_an_action_ends_with_its_clip(tmp_path):
             load_action(tmp_path, dataclasses.replace(action, **wrong))
 
 
-def test_one_explosion_does_not_stop_a_build(tmp_path, monkeypatch):
+def test_exploded_simulation_does_not_stop_a_build(tmp_path, monkeypatch):
     sheet = template("top")
     motion = load_motion("walk", fps=30)
     clip = dataclasses.replace(motion, rotations=motion.rotations[:3], root=motion.root[:3])
@@ -397,7 +400,7 @@ def test_one_explosion_does_not_stop_a_build(tmp_path, monkeypatch):
     assert meta["worst"] == {"strain_max": pytest.approx(0.3)}
 
 
-def test_an_action_begins_where_the_table_says(tmp_path):
+def test_action_begins_at_its_start_time(tmp_path):
     walk = load_motion("walk", fps=30)
     save_motion(tmp_path / "a.npz", walk)
     got = load_action(tmp_path, Action("train", "walk", "a.npz", 1.0, 30, None))
@@ -406,7 +409,7 @@ def test_an_action_begins_where_the_table_says(tmp_path):
     assert got.name == "walk"
 
 
-def test_shards_part_the_actions_among_them(data_dir, tmp_path, monkeypatch):
+def test_shards_partition_the_actions(data_dir, tmp_path, monkeypatch):
     done = []
     monkeypatch.setattr(
         _build, "_simulate", lambda config, at, name, action, *_: done.append(action.name)

@@ -11,22 +11,21 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from physxnet_jax.body import Registration, linear_blend_skinning
+from physxnet_jax.body import Registration, linear_blend_skinning, t_pose
 from physxnet_jax.cli import main
-from physxnet_jax.dressing import dress, make_character
+from physxnet_jax.dressing import Inference, Simulation, dress, make_character
 from physxnet_jax.dressing._character import (
     _corners,
     _near,
     _poses as character_poses,
-    clear_of_character,
-    inside_character,
-    on_character,
+    bind_to_character,
+    character_penetration,
+    resolve_character_collisions,
 )
-from physxnet_jax.dressing._dress import unbound_wearable
-from physxnet_jax.dressing._layers import layer_height
-from physxnet_jax.dressing._push_out import faces_at_rest, make_patch
+from physxnet_jax.dressing.postprocess._collisions import faces_at_rest, make_collider
+from physxnet_jax.dressing.postprocess._layers import layer_height
 from physxnet_jax.errors import PhysXNetError
-from physxnet_jax.garment import template
+from physxnet_jax.garment import make_skinned, template
 from physxnet_jax.geometry import closest_points, make_mesh, vertex_normals
 from physxnet_jax.io import AnimatedMesh, smooth_normals
 from physxnet_jax.motion import Motion, body_animation, clip_transforms, load_motion
@@ -48,7 +47,7 @@ def man(body):
     clip = load_motion("punch", fps=FPS, shape=shape)
     clip = Motion(clip.rotations[:8], clip.root[:8], FPS, "punch")
     rest = body.rest_vertices(shape)
-    world, shift = body.transforms(rest, body.t_pose(shape), jnp.asarray([0.0, 1.0, 0.0]))
+    world, shift = body.transforms(rest, t_pose(body, shape), jnp.asarray([0.0, 1.0, 0.0]))
     n = 13380
     bind = np.asarray(linear_blend_skinning(rest[:n], body.weights[:n], world, shift))
     faces = np.asarray(body.rest_mesh().faces)
@@ -68,8 +67,8 @@ def character(man):
     return make_character(mesh, FPS, bind=bind)
 
 
-@pytest.mark.slow
-def test_a_stranger_wears_what_he_would_wear(man, character):
+@pytest.mark.nightly
+def test_garments_on_a_registered_character_match_its_true_shape(man, character):
     shape, clip, mesh, _ = man
     assert character.apart < 0.008 and character.missed < 0.01
     worn = dress(character, ["top", "bottom"], method="lbs")
@@ -77,7 +76,7 @@ def test_a_stranger_wears_what_he_would_wear(man, character):
     other = dress(clip, ["top", "bottom"], method="lbs", fps=FPS)
     np.testing.assert_array_equal(worn.meshes[0].positions, mesh.positions)
     np.testing.assert_array_equal(worn.meshes[0].faces, mesh.faces)
-    assert worn.fps == FPS and "mm from yours" in worn.notes[0]
+    assert worn.fps == FPS and "mm from the mesh" in worn.notes[0]
     for a, b, wrong in zip(worn.garments, true.garments, other.garments, strict=True):
         assert a.name == b.name and rmse(a.positions, b.positions) < 0.02
         # The control: on another person's shape they are elsewhere.
@@ -86,15 +85,15 @@ def test_a_stranger_wears_what_he_would_wear(man, character):
     assert all(worn.inside[n] <= worn.inside_raw[n] for n in worn.inside)
 
 
-@pytest.mark.slow
-def test_what_is_moved_off_his_skin_stays_beneath_what_is_over_it(character, monkeypatch):
+@pytest.mark.nightly
+def test_inner_garments_stay_beneath_outer_ones_on_a_character(character, monkeypatch):
     known = []
 
-    def keep(layers, wearables, positions):
+    def keep(layers, positions):
         known[:] = layers
         return positions
 
-    monkeypatch.setattr("physxnet_jax.dressing._dress.lift_clip", keep)
+    monkeypatch.setattr("physxnet_jax.dressing._character.resolve_clip_layers", keep)
     crossing = dress(character, ["dress", "top"], method="lbs", frames=2)
     monkeypatch.undo()
     apart = dress(character, ["dress", "top"], method="lbs", frames=2)
@@ -113,37 +112,50 @@ def test_what_is_moved_off_his_skin_stays_beneath_what_is_over_it(character, mon
     assert apart.inside["top"] < 0.04
 
 
-def test_network_and_simulation_dress_him_too(man, character):
+@pytest.mark.release
+def test_network_and_simulation_dress_a_character(man, character):
     shape, clip, _, _ = man
-    worn = dress(character, ["bottom"], weights="nano", include_body=False)
-    true = dress(clip, ["bottom"], weights="nano", shape=shape, fps=FPS)
+    worn = dress(
+        character,
+        ["bottom"],
+        inference=Inference(weights="nano", strain_iterations=0),
+        include_body=False,
+    )
+    true = dress(
+        clip,
+        ["bottom"],
+        inference=Inference(weights="nano", strain_iterations=0),
+        shape=shape,
+        fps=FPS,
+    )
     assert rmse(worn.garments[0].positions, true.garments[0].positions) < 0.025
     assert [m.name for m in worn.meshes] == ["bottom"]
-    ways = {"method": "simulate", "accuracy": "draft", "frames": 3}
+    ways = {"method": "simulate", "simulation": Simulation(accuracy="draft"), "frames": 3}
     slow = dress(character, ["bottom"], **ways)
     assert slow.num_frames == 3 and len(slow.meshes[0].positions) == 3
     same = dress(clip, ["bottom"], shape=shape, fps=FPS, **ways)
     assert rmse(slow.garments[0].positions, same.garments[0].positions) < 0.025
 
 
-def test_cloth_goes_along_with_what_no_joint_moves(character):
+@pytest.mark.release
+def test_cloth_follows_residual_skin_motion(character):
     """A belly that swells by 3 cm takes the shirt with it; without that it doesn't."""
     rest = np.asarray(character.body.rest_vertices(character.body.default_shape()))[:13380]
     belly = np.exp(
         -0.5 * (np.linalg.norm(rest - (0.0, rest[:, 1].mean(), 0.12), axis=1) / 0.1) ** 2
     )
-    swell = np.zeros_like(character.leftover)
+    swell = np.zeros_like(character.residual)
     swell[-1] = 0.03 * belly[:, None] * [0.0, 0.0, 1.0]
-    plain = {"method": "lbs", "push_out": False}
+    plain = {"method": "lbs", "inference": Inference(collisions=False)}
     flat = dress(character, ["top"], **plain).garments[0].positions
-    grown = dataclasses.replace(character, leftover=character.leftover + swell)
+    grown = dataclasses.replace(character, residual=character.residual + swell)
     out = dress(grown, ["top"], **plain).garments[0].positions - flat
     np.testing.assert_allclose(out[:-1], 0.0, atol=1e-6)
     assert 0.015 < out[-1, :, 2].max() <= 0.0301
     assert np.abs(out[-1, :, :2]).max() < 1e-6
 
 
-def test_cloth_is_moved_out_of_the_skin_that_is_seen(character):
+def test_cloth_is_moved_out_of_the_character_surface(character):
     """Thighs that swell by 2 cm while no cloth goes along."""
     body, clip = character.body, character.motion
     rest = body.rest_vertices(body.default_shape())
@@ -155,23 +167,27 @@ def test_cloth_is_moved_out_of_the_skin_that_is_seen(character):
     swollen = 0.02 * np.einsum("vj,fjab,vb->fva", weights, world, outward) * thigh[:, None]
     swollen = swollen.astype(np.float32)
     surface = np.asarray(body_animation(body, clip)) + swollen
-    fat = dataclasses.replace(character, leftover=swollen, surface=surface)
-    g = on_character(template("bottom"), character)
-    w = unbound_wearable(body, rest, g)
-    patch = make_patch(body, rest, w, g.mesh)
-    tight = dress(character, ["bottom"], method="lbs", push_out=False).garments[0].positions
-    before = inside_character(fat, tight)
-    out = clear_of_character(patch, w, fat, tight, world, shift)
-    assert before > 0.05 and inside_character(fat, out) < 0.2 * before
+    fat = dataclasses.replace(character, residual=swollen, surface=surface)
+    g = bind_to_character(template("bottom"), character)
+    w = make_skinned(g, rest)
+    patch = make_collider(body, rest, w, g.mesh)
+    tight = (
+        dress(character, ["bottom"], method="lbs", inference=Inference(collisions=False))
+        .garments[0]
+        .positions
+    )
+    before = character_penetration(fat, tight)
+    out = resolve_character_collisions(patch, w, fat, tight, world, shift)
+    assert before > 0.05 and character_penetration(fat, out) < 0.2 * before
     assert np.linalg.norm(out - tight, axis=2).max() < 0.06
 
 
-def test_skin_is_looked_for_where_cloth_slid_but_not_on_another_limb(character):
+def test_near_skin_follows_sliding_cloth_but_not_to_another_limb(character):
     body = character.body
     rest = body.rest_vertices(body.default_shape())
-    g = on_character(template("bottom"), character)
-    w = unbound_wearable(body, rest, g)
-    patch = make_patch(body, rest, w, g.mesh)
+    g = bind_to_character(template("bottom"), character)
+    w = make_skinned(g, rest)
+    patch = make_collider(body, rest, w, g.mesh)
     still, skin, usual = (np.asarray(x) for x in (w.rest, patch.rest, faces_at_rest(patch)))
     middle = skin[np.asarray(patch.faces)].mean(axis=1)
 
@@ -191,7 +207,8 @@ def test_skin_is_looked_for_where_cloth_slid_but_not_on_another_limb(character):
     np.testing.assert_array_equal(_near(patch, still, skin, crossed)[shin], usual[shin])
 
 
-def test_skin_that_was_laid_onto_another_limb_is_left_out(man, monkeypatch):
+@pytest.mark.release
+def test_skin_registered_to_another_limb_is_ignored(man, monkeypatch):
     """One vertex goes its own way, as a thigh's does that was laid onto a hand."""
     _, _, mesh, bind = man
     carried = Registration.carried
@@ -206,13 +223,13 @@ def test_skin_that_was_laid_onto_another_limb_is_left_out(man, monkeypatch):
 
     monkeypatch.setattr(Registration, "carried", astray)
     other = make_character(mesh, FPS, bind=bind)
-    assert np.abs(found.leftover[:, lost]).max() > 0
-    assert np.abs(other.leftover[:, lost]).max() == 0
+    assert np.abs(found.residual[:, lost]).max() > 0
+    assert np.abs(other.residual[:, lost]).max() == 0
     rows = np.arange(13380) != lost
-    np.testing.assert_allclose(other.leftover[:, rows], found.leftover[:, rows], atol=2e-3)
+    np.testing.assert_allclose(other.residual[:, rows], found.residual[:, rows], atol=2e-3)
 
 
-def test_corners_of_a_coarse_mesh_are_known(character):
+def test_coarse_mesh_corners_above_the_skin_are_measured(character):
     skin = character.surface[:1]
     normals = smooth_normals(skin, np.asarray(character.body.rest_mesh().faces))
     # Where the next vertex is far enough for the nearest one to be the one beneath.
@@ -224,14 +241,14 @@ def test_corners_of_a_coarse_mesh_are_known(character):
     assert _corners(character.body, skin[:, rows] - 0.006 * normals[:, rows], skin).max() == 0.0
 
 
-def test_what_a_character_brings_cannot_be_given(body, character):
+def test_body_and_shape_are_refused_with_a_character(body, character):
     with pytest.raises(PhysXNetError, match="leave out body and shape"):
         dress(character, ["top"], shape=body.default_shape())
     with pytest.raises(PhysXNetError, match="leave out body and shape"):
         dress(character, ["top"], body=body)
 
 
-def test_the_likeliest_pose_is_tried_first(man):
+def test_registration_poses_are_tried_by_likelihood(man):
     """The bind pose, frame 0, then the frame that takes most room; no frame twice."""
     _, _, mesh, bind = man
     wide = mesh.positions.copy()
@@ -243,15 +260,24 @@ def test_the_likeliest_pose_is_tried_first(man):
     assert len(character_poses(mesh.positions[:1], None)) == 1
 
 
-def test_the_command_dresses_a_file(man, tmp_path, capsys):
+@pytest.mark.release
+def test_dress_command_dresses_an_animated_body_file(man, tmp_path, capsys):
     _, _, mesh, bind = man
     x = np.concatenate([bind[None], mesh.positions[:3]])[..., [0, 2, 1]] * [100.0, -100.0, 100.0]
     np.savez(tmp_path / "me.npz", me_positions=x, me_faces=mesh.faces, fps=FPS)
     out = tmp_path / "out.npz"
-    words = ["dress", str(tmp_path / "me.npz"), "--own-body", "--wear", "bottom", "--fps", "10"]
+    words = [
+        "dress",
+        str(tmp_path / "me.npz"),
+        "--animated-body",
+        "--wear",
+        "bottom",
+        "--fps",
+        "10",
+    ]
     assert main([*words, "--method", "lbs", "-o", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert "the unit is cm" in told and "Z is up" in told
+    printed = capsys.readouterr().out
+    assert "the unit is cm" in printed and "Z is up" in printed
     with np.load(out) as data:
         np.testing.assert_allclose(data["body_positions"][1:], mesh.positions[:3], atol=1e-4)
         low = data["bottom_positions"][..., 1].min() - data["body_positions"][..., 1].min()
@@ -259,10 +285,11 @@ def test_the_command_dresses_a_file(man, tmp_path, capsys):
         assert 0.0 < low < 0.2
     assert main([*words, "--shape", "gender=1"]) == 2
     assert main(["dress", "walk", "--body-mesh", "me"]) == 2
-    assert main(["dress", "walk", "--own-body"]) == 2
+    assert main(["dress", "walk", "--animated-body"]) == 2
 
 
-def test_a_rig_is_dressed_in_somebody_elses_motion(body, tmp_path, capsys):
+@pytest.mark.release
+def test_dress_command_retargets_a_motion_to_a_rig(body, tmp_path, capsys):
     shape = body.shape(gender=1.0, height_up=0.5)
     path = rigged_person(tmp_path / "me.vrm", body, shape)
     out = tmp_path / "out.npz"
@@ -277,7 +304,7 @@ def test_a_rig_is_dressed_in_somebody_elses_motion(body, tmp_path, capsys):
         assert np.abs(shift).max() < 0.03
         assert rmse(worn - shift, true.garments[0].positions) < 0.02
     capsys.readouterr()
-    assert main([*words, "--own-body"]) == 2 and "--own-body" in capsys.readouterr().err
+    assert main([*words, "--animated-body"]) == 2 and "--animated-body" in capsys.readouterr().err
     assert main(["dress", "walk", "--character-map", "a.toml"]) == 2
     assert "--character" in capsys.readouterr().err
     names = tmp_path / "names.toml"

@@ -5,25 +5,25 @@ import dataclasses
 import numpy as np
 import pytest
 
-from physxnet_jax.dressing import dress, pushed_network
-from physxnet_jax.dressing._blocks import dress_block
+from physxnet_jax.dressing import Inference, dress, infer_block
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.evaluation import network
 from physxnet_jax.garment import template
-from physxnet_jax.io import load_predictor
+from physxnet_jax.models import load_predictor
 from physxnet_jax.motion import animate, load_motion
 
 
 def test_lbs_is_linear_blend_skinning(body, rest):
     motion = load_motion("punch", fps=30.0)
-    clip = dress("punch", ["top"], method="lbs", frames=18, push_out=False)
+    clip = dress("punch", ["top"], method="lbs", frames=18, inference=Inference(collisions=False))
     g = template("top")
     expected = animate(body, rest, g.rest_vertices(rest), g.skin, motion)
     np.testing.assert_allclose(clip.garments[0].positions, np.asarray(expected)[:18], atol=1e-5)
     assert clip.hit_rate["top"] is None and clip.num_frames == 18
 
 
-def test_the_network_moves_cloth_away_from_skinning_but_stays_near_the_body():
+@pytest.mark.release
+def test_network_cloth_differs_from_skinning_and_stays_near_the_body():
     a = dress("walk", ["bottom", "dress"], frames=20)
     b = dress("walk", ["bottom", "dress"], method="lbs", frames=20)
     for x, y in zip(a.garments, b.garments):
@@ -39,26 +39,30 @@ def test_the_network_moves_cloth_away_from_skinning_but_stays_near_the_body():
     assert {s.name for s in a.stages} >= {"motion", "binding", "network", "body"}
 
 
-def test_another_clip_of_another_length_compiles_nothing():
+def test_clips_of_other_lengths_are_not_recompiled():
     dress("walk", ["bottom"], method="lbs", frames=3)
-    programs = dress_block._cache_size()
+    programs = infer_block._cache_size()
     dress("punch", ["bottom"], method="lbs", frames=40)
-    assert dress_block._cache_size() == programs
-    dress("walk", ["bottom"], method="lbs", frames=3, push_out=False)
-    assert dress_block._cache_size() == programs + 1, "another program is one more"
+    assert infer_block._cache_size() == programs
+    dress("walk", ["bottom"], method="lbs", frames=3, inference=Inference(collisions=False))
+    assert infer_block._cache_size() == programs + 1, "another program is one more"
 
 
-def test_the_simulation_is_what_its_own_rollout_says():
+@pytest.mark.release
+def test_simulated_cloth_is_finite_and_pinned_at_the_waist():
     # One garment needn't be a list.
     clip = dress("balance", template("bottom"), method="simulate", frames=4)
     assert np.isfinite(clip.garments[0].positions).all()
     waist = np.asarray(template("bottom").pinned)
-    lbs = dress("balance", ["bottom"], method="lbs", frames=4, push_out=False)
+    lbs = dress(
+        "balance", ["bottom"], method="lbs", frames=4, inference=Inference(collisions=False)
+    )
     gap = clip.garments[0].positions[:, waist] - lbs.garments[0].positions[:, waist]
     assert np.abs(gap).max() < 1e-4
 
 
-def test_trousers_go_beneath_a_top_and_stay_as_they_are_without_one():
+@pytest.mark.release
+def test_trousers_change_only_where_a_top_covers_them():
     both = dress("walk", ["top", "bottom"], frames=16)
     alone = dress("walk", ["bottom"], frames=16)
     rest_height = np.asarray(template("bottom").mesh.vertices)[:, 1]
@@ -69,27 +73,29 @@ def test_trousers_go_beneath_a_top_and_stay_as_they_are_without_one():
     assert gap[:, rest_height < -0.4].max() < 1e-4
 
 
-@pytest.mark.slow
-def test_two_garments_of_one_name_and_one_called_body_stay_apart(tmp_path):
+@pytest.mark.nightly
+def test_duplicate_garment_names_are_made_unique(tmp_path):
     named = dataclasses.replace(template("bottom"), name="body")
     clip = dress("walk", [named, "bottom", "bottom"], method="lbs", frames=2)
     assert [m.name for m in clip.meshes] == ["body", "body_2", "bottom", "bottom_2"]
 
 
-def test_nonsense_is_refused():
+def test_empty_outfits_and_zero_frames_are_refused():
     with pytest.raises(PhysXNetError, match="at least one garment"):
         dress("walk", [], method="lbs", frames=2)
     with pytest.raises(PhysXNetError, match="at least one"):
         dress("walk", method="lbs", frames=0)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("push", [False, True])
-def test_what_evaluation_measures_is_what_dress_gives(push):
+def test_evaluation_matches_dress(push):
     predictor = load_predictor()
-    method = pushed_network(predictor) if push else network(predictor)
+    inference = Inference(weights=predictor, collisions=push)
+    method = network(inference)
     motion = load_motion("punch", fps=30.0)
     short = dataclasses.replace(motion, rotations=motion.rotations[:20], root=motion.root[:20])
-    clip = dress(short, ["top"], include_body=False, push_out=push)
+    clip = dress(short, ["top"], include_body=False, inference=inference)
     measured = method(short, "top").positions
     # Before the first frame somebody who is measured stood still, as in the simulation.
     lead = predictor.config.inputs.window - 1
@@ -97,15 +103,20 @@ def test_what_evaluation_measures_is_what_dress_gives(push):
     assert np.abs(measured[:lead] - clip.garments[0].positions[:lead]).max() < 0.05
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("start", [0.1, 1.0])
-def test_a_part_of_a_motion_is_dressed_as_in_the_whole(start):
+def test_partial_motion_matches_the_whole_motion(start):
     """What was before its first frame is the motion's own, not made up."""
     first = round(30 * start)
-    (whole,) = dress("punch", ["top"], frames=first + 4, push_out=False).garments
-    (part,) = dress("punch", ["top"], start=start, frames=4, push_out=False).garments
+    (whole,) = dress(
+        "punch", ["top"], frames=first + 4, inference=Inference(collisions=False)
+    ).garments
+    (part,) = dress(
+        "punch", ["top"], start=start, frames=4, inference=Inference(collisions=False)
+    ).garments
     np.testing.assert_allclose(part.positions, whole.positions[first:], atol=1e-5)
     # The control: the same frames as a motion of their own.
     clip = load_motion("punch", fps=30.0)
     alone = dataclasses.replace(clip, rotations=clip.rotations[first:], root=clip.root[first:])
-    (other,) = dress(alone, ["top"], frames=4, push_out=False).garments
+    (other,) = dress(alone, ["top"], frames=4, inference=Inference(collisions=False)).garments
     assert np.abs(other.positions - whole.positions[first:]).max() > 1e-3

@@ -13,18 +13,18 @@ import numpy as np
 import pytest
 
 from physxnet_jax.dressing import (
+    Inference,
     clothe,
-    clothe_frame,
+    clothe_step,
     dress,
     export_dresser,
+    init_stream,
     make_dresser,
-    start_clothing,
     with_shape,
 )
-from physxnet_jax.dressing._dresser import _check_pose
+from physxnet_jax.dressing._clothe import _check_pose
 from physxnet_jax.errors import PhysXNetError
-from physxnet_jax.io import load_predictor
-from physxnet_jax.models import PAPER, fold_batch_norm
+from physxnet_jax.models import PAPER, fold_batch_norm, load_predictor
 from physxnet_jax.motion import load_motion
 
 
@@ -33,7 +33,7 @@ def whole(dresser, motion):
     return jax.jit(clothe, static_argnames="fps")(dresser, *motion, fps=30.0)
 
 
-def test_the_layer_gives_what_dress_gives(whole, motion):
+def test_clothe_matches_dress(whole, motion):
     from physxnet_jax.motion import make_motion
 
     clip = make_motion(*(np.asarray(x) for x in motion), 30.0)
@@ -41,10 +41,10 @@ def test_the_layer_gives_what_dress_gives(whole, motion):
     np.testing.assert_allclose(np.asarray(whole["bottom"]), positions, atol=1e-5)
 
 
-def test_a_frame_at_a_time_is_the_clip(dresser, whole, motion):
-    step = jax.jit(clothe_frame, static_argnames="fps", donate_argnames="stream")
+def test_stream_matches_the_clip(dresser, whole, motion):
+    step = jax.jit(clothe_step, static_argnames="fps", donate_argnames="stream")
     rotations, root = motion
-    stream = start_clothing(dresser, rotations, root)
+    stream = init_stream(dresser, rotations, root)
     for k in range(len(rotations)):
         stream, cloth = step(dresser, stream, rotations[k], root[k], fps=30.0)
         np.testing.assert_allclose(
@@ -52,7 +52,7 @@ def test_a_frame_at_a_time_is_the_clip(dresser, whole, motion):
         )
 
 
-def test_people_are_batched_by_vmap(dresser, whole, motion):
+def test_vmap_batches_over_people(dresser, whole, motion):
     rotations, root = motion
     crowd = jnp.stack([root, root + jnp.array([[1.0, 0.0, 2.0]])])
     out = jax.jit(jax.vmap(lambda p: clothe(dresser, rotations, p, 30.0)))(crowd)["bottom"]
@@ -67,22 +67,28 @@ def shapes(dresser):
     return jnp.stack([body.shape(weight_up=0.6), body.default_shape(), body.shape(height_up=0.5)])
 
 
-def test_clothes_follow_the_shape_as_if_made_for_it(dresser, shapes, motion):
-    for push_out in (False, True):
-        mine = dataclasses.replace(dresser, push_out=push_out)
-        made = make_dresser(["bottom"], shape=shapes[0], push_out=push_out)
+def _with_collisions(dresser, wanted):
+    return dresser if wanted else dataclasses.replace(dresser, colliders=None, layers=None)
+
+
+@pytest.mark.release
+def test_with_shape_matches_a_dresser_made_for_the_shape(dresser, shapes, motion):
+    for collisions in (False, True):
+        mine = _with_collisions(dresser, collisions)
+        made = make_dresser(["bottom"], shape=shapes[0], inference=Inference(collisions=collisions))
         run = jax.jit(lambda d: clothe(d, *motion, 30.0)["bottom"])
         moved, wanted, before = run(with_shape(mine, shapes[0])), run(made), run(mine)
         np.testing.assert_allclose(np.asarray(moved), np.asarray(wanted), atol=1e-5)
         assert float(jnp.linalg.norm(before - wanted, axis=2).mean()) > 2e-3, "another shape"
 
 
-def test_shapes_are_batched_and_differentiated(dresser, shapes, motion):
+@pytest.mark.release
+def test_with_shape_supports_vmap_and_gradients(dresser, shapes, motion):
     """A crowd by vmap is one after the other; the slope by a parameter is the difference's."""
 
     @jax.jit
     def cloth(shape):
-        person = with_shape(dataclasses.replace(dresser, push_out=False), shape)
+        person = with_shape(_with_collisions(dresser, False), shape)
         return clothe(person, *motion, 30.0)["bottom"]
 
     crowd = jax.jit(jax.vmap(cloth))(shapes)
@@ -101,17 +107,17 @@ def test_shapes_are_batched_and_differentiated(dresser, shapes, motion):
     assert abs(slope) > 1e-5
 
 
-def test_the_shape_of_a_dress_by_the_papers_network_is_refused(dresser):
+def test_with_shape_is_refused_for_a_dress_of_the_paper_family(dresser):
     config = dataclasses.replace(dresser.predictor.config, inputs=PAPER)
-    wearables = (dataclasses.replace(dresser.wearables[0], template="dress"),)
+    worn = (dataclasses.replace(dresser.worn[0], template="dress"),)
     predictor = dataclasses.replace(dresser.predictor, config=config)
-    skirt = dataclasses.replace(dresser, predictor=predictor, wearables=wearables)
+    skirt = dataclasses.replace(dresser, predictor=predictor, worn=worn)
     with pytest.raises(ValueError, match="make_dresser"):
         with_shape(skirt, dresser.body.default_shape())
 
 
-@pytest.mark.slow
-def test_the_root_pulls_the_cloth_along(dresser, motion):
+@pytest.mark.nightly
+def test_cloth_height_follows_the_root_one_to_one(dresser, motion):
     """The mean height of the cloth rises with the root, one for one, whatever is between."""
     rotations, root = motion
 
@@ -126,13 +132,14 @@ def test_the_root_pulls_the_cloth_along(dresser, motion):
     assert float(jax.grad(height)(jnp.float32(0.0))) == pytest.approx(1.0, abs=2e-3)
 
 
-def test_an_export_runs_without_this_package(dresser, whole, motion, tmp_path):
+@pytest.mark.release
+def test_exported_dresser_runs_without_this_package(dresser, whole, motion, tmp_path):
     pytest.importorskip("flatbuffers")
     files = export_dresser(tmp_path / "out", dresser, name="local")
     assert all(f.is_file() for f in files)
     card = json.loads((tmp_path / "out" / "card.json").read_text())
     assert card["garments"] == {"bottom": 2726} and card["weights"]["name"] == "local"
-    assert card["relaxation_steps"] == 8 and not card["asked_mirrored"] and card["push_out"]
+    assert card["strain_iterations"] == 8 and not card["tta"] and card["collisions"]
     assert card["platforms"] == ["cpu", "cuda"], "lowered for both, wherever it is written"
     faces = np.load(tmp_path / "out" / "garments.npz")["bottom_faces"]
     assert faces.max() == 2725
@@ -159,61 +166,70 @@ def test_an_export_runs_without_this_package(dresser, whole, motion, tmp_path):
     assert done.returncode != 0 and "damaged" in done.stderr
 
 
-def test_templates_are_bound_where_they_lie_on_a_body_of_other_proportions(body):
+def test_template_binding_is_unchanged_on_a_scaled_body(body):
     large = dataclasses.replace(body, bases=1.15 * body.bases, deltas=1.15 * body.deltas)
     ours, theirs = (
-        make_dresser(["bottom"], body=b, weights="nano", push_out=False) for b in (body, large)
+        make_dresser(
+            ["bottom"],
+            body=b,
+            inference=Inference(weights="nano", strain_iterations=0, collisions=False),
+        )
+        for b in (body, large)
     )
-    tied = theirs.wearables[0].binding
-    assert tied.hit_rate > 0.95 and tied.fallbacks <= ours.wearables[0].binding.fallbacks + 30
-    same = np.asarray(tied.texel) == np.asarray(ours.wearables[0].binding.texel)
+    tied = theirs.worn[0].binding
+    assert tied.hit_rate > 0.95 and tied.fallbacks <= ours.worn[0].binding.fallbacks + 30
+    same = np.asarray(tied.texel) == np.asarray(ours.worn[0].binding.texel)
     assert same.all(axis=1).mean() > 0.9
 
 
-def test_unknown_platforms_are_named(dresser, tmp_path):
+def test_unknown_platforms_are_refused_with_the_known_ones(dresser, tmp_path):
     with pytest.raises(PhysXNetError, match="no platform 'toaster'; there are cpu"):
         export_dresser(tmp_path / "out", dresser, platforms=("cpu", "toaster"))
     assert not (tmp_path / "out").exists()
 
 
-def test_garments_without_a_decoder_are_named():
+def test_garments_without_a_decoder_are_refused():
     with pytest.raises(PhysXNetError, match="one of top, bottom, dress"):
         make_dresser(["cape"])
 
 
-def test_another_size_of_a_garment_is_the_same_program(dresser, motion):
+def test_garment_sizes_share_one_compiled_program(dresser, motion):
     """Sizes of one pattern share a compiled program, whatever is told of their files."""
     base = dresser.garments[0]
     wide = base.mesh.replace(vertices=base.mesh.vertices * jnp.float32([[1.03, 1.0, 1.03]]))
-    other = make_dresser([dataclasses.replace(base, mesh=wide)], weights=dresser.predictor)
-    one = make_dresser([base], weights=dresser.predictor)
+    other = make_dresser(
+        [dataclasses.replace(base, mesh=wide)],
+        inference=Inference(weights=dresser.predictor, strain_iterations=0),
+    )
+    one = make_dresser([base], inference=Inference(weights=dresser.predictor, strain_iterations=0))
     noted = dataclasses.replace(other, notes=type(other.notes)(["too wide"]))
     assert noted.notes[0] == "too wide" and tuple(one.notes) != tuple(noted.notes)
     assert jax.tree.structure(one) == jax.tree.structure(noted)
-    counted = jax.jit(lambda d: d.wearables[0].rest.sum())
+    counted = jax.jit(lambda d: d.worn[0].rest.sum())
     counted(one), counted(noted)
     assert counted._cache_size() == 1
 
 
-def test_a_clip_of_no_frames_is_refused(dresser, motion):
+def test_empty_clips_are_refused(dresser, motion):
     q, p = motion
     with pytest.raises(ValueError, match="no frames"):
         clothe(dresser, q[:0], p[:0], fps=30.0)
     with pytest.raises(ValueError, match="no pose"):
-        start_clothing(dresser, q[:0], p[:0])
+        init_stream(dresser, q[:0], p[:0])
 
 
-def test_two_poses_say_how_a_clip_begins(dresser, whole, motion):
+@pytest.mark.release
+def test_two_frame_clip_matches_the_start_of_a_longer_one(dresser, whole, motion):
     """A clip of two frames is the first two of a longer one, live as well."""
     q, p = motion
     two = jax.jit(clothe, static_argnames="fps")(dresser, q[:2], p[:2], fps=30.0)
     np.testing.assert_allclose(two["bottom"], np.asarray(whole["bottom"])[:2], atol=1e-5)
-    stream = start_clothing(dresser, q[:2], p[:2])
-    cloth = clothe_frame(dresser, stream, q[0], p[0], fps=30.0)[1]
+    stream = init_stream(dresser, q[:2], p[:2])
+    cloth = clothe_step(dresser, stream, q[0], p[0], fps=30.0)[1]
     np.testing.assert_allclose(cloth["bottom"], np.asarray(whole["bottom"])[0], atol=1e-5)
 
 
-def test_poses_of_another_skeleton_are_refused_also_under_jit(dresser, motion):
+def test_poses_of_another_skeleton_are_refused_under_jit_too(dresser, motion):
     q, p = motion
     wrong = [(q[:, :22], p), (jnp.tile(q, (1, 2, 1)), p)]
     for rotations, root in wrong:
@@ -224,22 +240,22 @@ def test_poses_of_another_skeleton_are_refused_also_under_jit(dresser, motion):
         with pytest.raises(ValueError, match="31 joints"):
             _check_pose(dresser.body, rotations, root, ("frames",))
     with pytest.raises(ValueError, match="31 joints"):
-        start_clothing(dresser, q[0, :24], p[0])
-    stream = start_clothing(dresser, q[0], p[0])
+        init_stream(dresser, q[0, :24], p[0])
+    stream = init_stream(dresser, q[0], p[0])
     with pytest.raises(ValueError, match="31 joints"):
-        clothe_frame(dresser, stream, q[0, :24], p[0], fps=30.0)
+        clothe_step(dresser, stream, q[0, :24], p[0], fps=30.0)
     with pytest.raises(ValueError, match=r"9 parameters, .*height"):
         with_shape(dresser, jnp.ones(5))
 
 
-def test_weights_may_be_a_predictor_and_one_garment_a_word(dresser, motion):
+def test_dress_accepts_a_predictor_and_a_single_garment_name(dresser, motion):
     known = dresser.predictor
-    clip = dress("walk", "bottom", weights=known, frames=2)
+    clip = dress("walk", "bottom", inference=Inference(weights=known), frames=2)
     again = dress("walk", ["bottom"], frames=2)
     np.testing.assert_array_equal(clip.garments[0].positions, again.garments[0].positions)
 
 
-def test_weights_are_loaded_inside_a_traced_function_too(motion):
+def test_weights_can_be_loaded_under_jit(motion):
     @jax.jit
     def total(x):
         return x * jax.tree.leaves(load_predictor("nano").state)[0].sum()
@@ -248,19 +264,24 @@ def test_weights_are_loaded_inside_a_traced_function_too(motion):
     assert float(total(jnp.ones(()))) == pytest.approx(want, rel=1e-5)
 
 
-@pytest.mark.slow
-def test_a_predictor_of_another_person_dresses_this_one(dresser, shapes, motion):
+@pytest.mark.nightly
+def test_predictor_is_moved_to_the_requested_body(dresser, shapes, motion):
     """Its texels are put onto the body that is asked for, whatever body they were on."""
     heavy = make_dresser(["bottom"], shape=shapes[0])
-    again = make_dresser(["bottom"], weights=heavy.predictor)
-    usual = make_dresser(["bottom"], weights=fold_batch_norm(load_predictor()))
+    again = make_dresser(
+        ["bottom"], inference=Inference(weights=heavy.predictor, strain_iterations=0)
+    )
+    usual = make_dresser(
+        ["bottom"],
+        inference=Inference(weights=fold_batch_norm(load_predictor()), strain_iterations=0),
+    )
     a, b = (clothe(d, *(x[:3] for x in motion), 30.0) for d in (again, usual))
     np.testing.assert_allclose(a["bottom"], b["bottom"], atol=1e-6)
     other = clothe(heavy, *(x[:3] for x in motion), 30.0)
     assert np.abs(np.asarray(other["bottom"] - a["bottom"])).max() > 5e-3
 
 
-def test_what_is_told_of_files_is_no_part_of_the_program(dresser):
+def test_notes_do_not_cause_recompilation(dresser):
     told = dataclasses.replace(dresser, notes=("a",))
     other = dataclasses.replace(dresser, notes=("b",))
     traced = []
@@ -274,13 +295,14 @@ def test_what_is_told_of_files_is_no_part_of_the_program(dresser):
     assert told.notes == ("a",) and jax.tree.structure(told) == jax.tree.structure(other)
 
 
-def test_people_are_spread_over_devices_by_shard_map(tmp_path):
+@pytest.mark.nightly
+def test_shard_map_distributes_people_over_devices(tmp_path):
     """In a process of two devices: one person on each is what one process says of both."""
     code = """
 import jax, jax.numpy as jnp, numpy as np
 from jax.sharding import Mesh, PartitionSpec as P
 import physxnet_jax as px
-dresser = px.make_dresser(["bottom"], weights="nano")
+dresser = px.make_dresser(["bottom"], inference=px.Inference(weights="nano"))
 motion = px.load_motion("walk", fps=30)
 q = jnp.stack([motion.rotations[:2], motion.rotations[2:4]])
 p = jnp.stack([motion.root[:2], motion.root[2:4]])
@@ -297,7 +319,7 @@ for f, specs in ((move, (each, all_alike)), (move, (all_alike, each)), (wear, (e
 # What is measured on the other device runs there, whatever was made on the first before.
 other = jax.devices()[1]
 with jax.default_device(other):
-    anew = px.make_dresser(["bottom"], weights="nano")
+    anew = px.make_dresser(["bottom"], inference=px.Inference(weights="nano"))
     there = jax.jit(lambda d, a, b: px.clothe(d, a, b, 30.0)["bottom"])(anew, q[0], p[0])
 assert there.devices() == {other}, there.devices()
 here = px.clothe(dresser, q[0], p[0], 30.0)["bottom"]
@@ -316,12 +338,14 @@ print(len(jax.devices()), "devices")
     assert done.returncode == 0 and "2 devices" in done.stdout, done.stderr[-2000:]
 
 
-@pytest.mark.parametrize("fps", [30.0, pytest.param(120.0, marks=pytest.mark.slow)])
-def test_a_clip_begins_without_a_jump(fps):
+@pytest.mark.parametrize("fps", [30.0, pytest.param(120.0, marks=pytest.mark.nightly)])
+def test_clip_starts_without_a_jump(fps):
     """Cloth accelerates in the first frames as in those after, however many there are a second."""
     walk = load_motion("walk", fps=fps)
     clip = dataclasses.replace(walk, rotations=walk.rotations[15:47], root=walk.root[15:47])
-    dresser = make_dresser(["bottom"], weights="nano", push_out=False)
+    dresser = make_dresser(
+        ["bottom"], inference=Inference(weights="nano", strain_iterations=0, collisions=False)
+    )
     worn = jax.jit(clothe, static_argnames="fps")(dresser, clip.rotations, clip.root, fps=fps)
 
     def jumps(x):
@@ -330,12 +354,18 @@ def test_a_clip_begins_without_a_jump(fps):
 
     now = jumps(worn["bottom"])
     assert now[:4].max() < 2.0 * now[4:].max()
-    again = dress(clip, ["bottom"], weights="nano", push_out=False, fps=fps, include_body=False)
+    again = dress(
+        clip,
+        ["bottom"],
+        inference=Inference(weights="nano", strain_iterations=0, collisions=False),
+        fps=fps,
+        include_body=False,
+    )
     np.testing.assert_allclose(again.garments[0].positions, worn["bottom"], atol=1e-5)
     if fps > 100:
         # The control: somebody who stood still until then is thrown into motion.
-        stream = start_clothing(dresser, clip.rotations[0], clip.root[0])
-        step = jax.jit(clothe_frame, static_argnames="fps")
+        stream = init_stream(dresser, clip.rotations[0], clip.root[0])
+        step = jax.jit(clothe_step, static_argnames="fps")
         thrown = []
         for q, p in zip(clip.rotations[:8], clip.root[:8]):
             stream, cloth = step(dresser, stream, q, p, fps=fps)
@@ -343,7 +373,8 @@ def test_a_clip_begins_without_a_jump(fps):
         assert jumps(thrown)[:4].max() > 5.0 * now[4:].max()
 
 
-def test_an_export_moves_at_the_rate_that_it_is_for(dresser, motion, tmp_path):
+@pytest.mark.release
+def test_exported_dresser_uses_its_frame_rate(dresser, motion, tmp_path):
     """Velocities are metres a second: the same poses twice as fast are another cloth."""
     pytest.importorskip("flatbuffers")
     export_dresser(tmp_path, dresser, fps=60.0, platforms=("cpu",))

@@ -6,15 +6,17 @@ import runpy
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
-from physxnet_jax.dressing import make_dresser
+from physxnet_jax.dressing import Inference, make_dresser
 from physxnet_jax.motion import load_motion
 
 MADE = runpy.run_path(str(pathlib.Path(__file__).parents[2] / "experiments/recover_motion.py"))
 
 
-def test_a_turned_pose_is_found_from_its_clothes():
-    dresser = make_dresser(["bottom"], push_out=False)
+@pytest.mark.release
+def test_pose_is_recovered_from_its_cloth():
+    dresser = make_dresser(["bottom"], inference=Inference(collisions=False))
     walk = load_motion("walk", fps=30.0)
     true = walk.rotations[10:12], walk.root[10:12]
     layer = MADE["skinning_layer"](dresser)

@@ -15,7 +15,8 @@ from physxnet_jax.evaluation import (
     time_to_error,
 )
 from physxnet_jax.garment import square_sheet
-from physxnet_jax.simulation import XPBD, Gravity, Pin, Scene, Stretch
+from physxnet_jax.simulation import XPBD, Scene
+from physxnet_jax.simulation.effects import Gravity, Pin, Stretch
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +34,8 @@ def rows():
     return list(bench_simulation([small], methods=methods))
 
 
-@pytest.mark.slow
-def test_doing_nothing_lands_worst_and_more_substeps_nearer(rows):
+@pytest.mark.nightly
+def test_baseline_is_worst_and_more_substeps_reduce_the_error(rows):
     by = {(r.solver, r.setting): r for r in rows}
     assert not any(r.failed for r in rows)
     worst = max(rows, key=lambda r: r.rms_mm)
@@ -48,13 +49,15 @@ def test_doing_nothing_lands_worst_and_more_substeps_nearer(rows):
     assert time_to_error(rows, 0.0) is None
 
 
-def test_rows_that_are_there_are_not_measured_again(rows):
+@pytest.mark.release
+def test_existing_rows_are_not_measured_again(rows):
     sheet = dataclasses.replace(bench_scenes()[0], frames=3)
     methods = [("xpbd", "8", XPBD(8, 1))]
     assert list(bench_simulation([sheet], methods=methods, done=rows)) == []
 
 
-def test_the_command_writes_table_and_diagram(tmp_path, rows, capsys):
+@pytest.mark.release
+def test_bench_sim_command_writes_table_and_plot(tmp_path, rows, capsys):
     out = tmp_path / "bench.json"
     # Every row the command would measure is there already.
     there = [dataclasses.replace(rows[0], solver=n, setting=k) for n, k, _ in solvers(False)]

@@ -8,7 +8,7 @@ import pytest
 
 from physxnet_jax.data import Sequence
 from physxnet_jax.evaluation import (
-    Answer,
+    Prediction,
     check_sequence,
     error_tables,
     evaluate,
@@ -44,7 +44,8 @@ def measure(methods, sequences, done=()):
     return list(evaluate(methods, sequences, templates=("bottom",), done=done))
 
 
-def test_skinning_is_off_by_the_offset_and_no_more():
+@pytest.mark.release
+def test_skinning_error_equals_the_offset():
     rows = measure({"lbs": skinning()}, [sequence(), sequence("shifted", offset=(0.0, 0.01, 0.0))])
     assert [r.action for r in rows] == ["walk", "shifted"]
     assert rows[0].rmse_vertices_mm < 1e-3 and rows[0].wrinkle_deg < 0.05
@@ -60,7 +61,8 @@ def test_skinning_is_off_by_the_offset_and_no_more():
     assert "| shifted | 10.0 |" in table and "Reference: test" in table
 
 
-def test_rows_that_are_there_are_not_measured_again():
+@pytest.mark.release
+def test_existing_rows_are_not_measured_again():
     asked = []
 
     def method(motion, name):
@@ -74,29 +76,29 @@ def test_rows_that_are_there_are_not_measured_again():
     assert [r.action for r in again] == ["b"] and asked == [24, 20]
 
 
-def test_frames_that_are_not_finite_are_counted_and_left_out():
+def test_non_finite_frames_are_counted_and_excluded():
     def broken(motion, name):
         x = skinning()(motion, name).positions.copy()
         x[5] = np.nan
-        return Answer(x, 1.0)
+        return Prediction(x, 1.0)
 
     (row,) = measure({"broken": broken}, [sequence()])
     assert row.finite_share == pytest.approx(23 / 24)
     assert row.rmse_vertices_mm < 1e-3
     assert np.isnan(row.jitter) and np.isnan(row.acceleration_error), "not across the gap"
     lost = measure(
-        {"nothing": lambda m, n: Answer(broken(m, n).positions * np.nan, 1.0)}, [sequence()]
+        {"nothing": lambda m, n: Prediction(broken(m, n).positions * np.nan, 1.0)}, [sequence()]
     )
     assert lost[0].finite_share == 0.0 and np.isnan(lost[0].rmse_vertices_mm)
 
 
-def test_clips_too_short_to_jerk_have_a_table_too():
+def test_clips_too_short_for_jerk_are_tabulated():
     rows = measure({"lbs": skinning()}, [sequence(frames=3)])
     assert rows[0].jitter_reference == 0.0
     assert "| lbs | bottom | 0.0 |" in error_tables(rows)
 
 
-def test_cloth_that_came_off_is_no_reference():
+def test_detached_cloth_is_not_a_reference():
     off = {**META, "worst": {"penetration_max": 0.2}}
     assert measure({"lbs": skinning()}, [sequence(meta=off)]) == []
 
@@ -110,7 +112,8 @@ def bent(seed=0, frames=40):
     return dataclasses.replace(s, offsets={"bottom": offsets})
 
 
-def test_the_nearest_frame_of_the_training_set_is_the_frame_itself():
+@pytest.mark.release
+def test_nearest_frame_reproduces_training_frames():
     known = bent()
     frames = training_frames([known], ("bottom",))
     (row,) = measure({"nearest": nearest_frame(frames)}, [known])
@@ -118,14 +121,15 @@ def test_the_nearest_frame_of_the_training_set_is_the_frame_itself():
     assert np.abs(known.offsets["bottom"]).max() > 0.02
 
 
-def test_the_pose_network_learns_what_the_pose_decides():
+@pytest.mark.release
+def test_pose_network_learns_pose_dependent_offsets():
     known = bent()
     frames = training_frames([known], ("bottom",))
     rows = measure({"mlp": pose_network(frames, steps=300), "lbs": skinning()}, [known])
     assert rows[0].rmse_vertices_mm < 0.3 * rows[1].rmse_vertices_mm
 
 
-def test_pose_features_do_not_see_where_the_person_stands_or_faces(body, rest):
+def test_pose_features_are_invariant_to_position_and_heading(body, rest):
     from scipy.spatial.transform import Rotation
 
     from physxnet_jax.motion import clip_transforms
@@ -143,7 +147,7 @@ def test_pose_features_do_not_see_where_the_person_stands_or_faces(body, rest):
     assert np.abs(a[0] - a[20]).max() > 0.05
 
 
-def test_a_check_finds_explosions_wrong_counts_and_stretched_cloth():
+def test_check_detects_explosions_wrong_counts_and_stretched_cloth():
     fine = check_sequence(sequence(), 24)
     assert all(f.holds for f in fine if "inside" not in f.quantity), "skinning is calm cloth"
     far = sequence(offset=(0.0, 0.9, 0.0))
@@ -152,7 +156,7 @@ def test_a_check_finds_explosions_wrong_counts_and_stretched_cloth():
     short = sequence()
     short.offsets["bottom"] = short.offsets["bottom"][:-2]
     wrong = {f.quantity for f in check_sequence(short) if not f.holds}
-    assert wrong == {"frames unlike the motion's"}
+    assert wrong == {"frame count difference to motion"}
     still = sequence(frames=8)
     pose = make_motion(*(np.tile(x[:1], (8, *[1] * (x.ndim - 1))) for x in (
         np.asarray(still.motion.rotations), np.asarray(still.motion.root))), 30.0)  # fmt: skip
@@ -163,10 +167,10 @@ def test_a_check_finds_explosions_wrong_counts_and_stretched_cloth():
     torn.offsets["bottom"][:, ::2] += 0.05
     torn.offsets["bottom"][::2, 1::2] -= 0.05
     wrong = {f.quantity for f in check_sequence(torn) if not f.holds}
-    assert {"strain, 99 %", "jerk over that of skinning"} <= wrong
+    assert {"strain, 99 %", "jerk relative to skinning"} <= wrong
 
 
-def test_strain_and_folds_are_told_beside_those_of_the_reference():
+def test_strain_and_fold_strength_are_compared_with_the_reference():
     rough = sequence(frames=6)
     rough.offsets["bottom"] += np.random.default_rng(0).normal(0, 2e-3, (6, BOTTOM, 3)).astype("f4")
     (row,) = measure({"lbs": skinning()}, [rough])
@@ -182,7 +186,7 @@ def test_strain_and_folds_are_told_beside_those_of_the_reference():
     )
 
 
-def test_cloth_that_has_no_room_is_counted_apart(monkeypatch):
+def test_pinched_cloth_is_counted_separately(monkeypatch):
     def seen(assembly, motion, positions, *, frames, bare_skin):
         inside = np.zeros((len(frames), BOTTOM), bool)
         pinched, depth = inside.copy(), np.zeros(inside.shape)
@@ -197,15 +201,15 @@ def test_cloth_that_has_no_room_is_counted_apart(monkeypatch):
     assert row.penetration_mm == pytest.approx(2.0)
 
 
-def test_only_times_are_measured_again():
+def test_retime_measures_only_times():
     one = sequence(frames=6)
     rows = measure({"lbs": skinning(), "other": skinning()}, [one])
-    slow = lambda motion, name: Answer(skinning()(motion, name).positions + 1.0, 77.0)  # noqa: E731
+    slow = lambda motion, name: Prediction(skinning()(motion, name).positions + 1.0, 77.0)  # noqa: E731
     again = list(retime({"lbs": slow}, [one], rows))
     assert again == [dataclasses.replace(rows[0], ms_per_frame=77.0), rows[1]]
 
 
-def test_a_check_finds_cloth_in_the_body():
+def test_check_detects_cloth_inside_the_body():
     sunk = sequence(frames=3)
     skinned = jnp.asarray(skinning()(sunk.motion, "bottom").positions)
     sunk.offsets["bottom"] -= 0.02 * np.asarray(

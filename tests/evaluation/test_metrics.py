@@ -7,7 +7,7 @@ import pytest
 from physxnet_jax.evaluation import vertex_error
 
 
-def test_a_known_shift_has_a_known_error():
+def test_vertex_error_of_a_known_shift_is_exact():
     x = np.random.default_rng(0).normal(size=(3, 7, 3)).astype(np.float32)
     e = vertex_error(x + np.array([0.003, 0.0, 0.004], np.float32), x)
     assert e.rmse_mm == pytest.approx(5.0, rel=1e-3) and e.mse_mm2 == pytest.approx(25.0, rel=1e-3)

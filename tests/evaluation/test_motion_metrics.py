@@ -24,13 +24,13 @@ def folded(angle):
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, -0.4, 1.5, -3.0])
-def test_the_angle_of_a_fold(angle):
+def test_dihedral_angle_of_a_fold_is_exact(angle):
     seen = dihedral_angles(FACES, folded(angle)[None])
     assert abs(seen[0, 0]) == pytest.approx(abs(angle), abs=1e-6)
     assert np.sign(seen[0, 0]) == np.sign(angle) * np.sign(dihedral_angles(FACES, folded(1)[None]))
 
 
-def test_wrinkles_do_not_care_where_the_cloth_is():
+def test_wrinkle_error_is_invariant_to_translation():
     x = np.stack([folded(a) for a in (0.1, 0.5, 1.0)])
     assert wrinkle_error(FACES, x + 5.0, x) < 1e-3
     assert wrinkle_error(FACES, np.stack([folded(0.0)] * 3), np.stack([folded(0.5)] * 3)) == (
@@ -42,7 +42,7 @@ def test_wrinkles_do_not_care_where_the_cloth_is():
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.4, -1.5])
-def test_folds_are_as_strong_as_their_angle_wherever_they_are(angle):
+def test_fold_strength_is_the_fold_angle_at_any_position(angle):
     x = np.stack([folded(angle), folded(angle) + 3.0, folded(-angle)])
     assert fold_strength(FACES, x) == pytest.approx(np.degrees(abs(angle)), abs=1e-3)
     assert fold_strength(FACES, np.stack([folded(0.3), folded(0.0)])) == pytest.approx(
@@ -50,7 +50,7 @@ def test_folds_are_as_strong_as_their_angle_wherever_they_are(angle):
     )
 
 
-def test_area_strain_of_a_stretched_sheet():
+def test_area_strain_of_a_stretched_sheet_is_exact():
     sheet = square_sheet(4)
     x, faces = np.asarray(sheet.mesh.vertices), np.asarray(sheet.mesh.faces)
     out = area_strain(x, faces, np.stack([x, x * np.float32(1.1)]))
@@ -58,7 +58,7 @@ def test_area_strain_of_a_stretched_sheet():
     np.testing.assert_allclose(out[1], 0.21, atol=1e-5)
 
 
-def test_jerk_and_acceleration_of_polynomials():
+def test_jerk_and_acceleration_of_polynomials_are_exact():
     t = np.arange(12) / 30.0
     x = np.zeros((12, 2, 3))
     x[:, 0, 1] = t**3

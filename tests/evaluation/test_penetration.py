@@ -10,7 +10,8 @@ from physxnet_jax.evaluation import edge_strain, penetration
 from physxnet_jax.garment import template
 from physxnet_jax.geometry import vertex_normals
 from physxnet_jax.motion import Motion, animate
-from physxnet_jax.simulation import Gravity, Scene, prepare_scene
+from physxnet_jax.simulation import Scene, prepare_scene
+from physxnet_jax.simulation.effects import Gravity
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +21,7 @@ def standing(body, rest):
 
 
 @pytest.mark.parametrize("name", ["top", "bottom"])
-def test_clothes_at_rest_are_outside_and_sunk_ones_inside(body, rest, standing, name):
+def test_rest_cloth_is_outside_and_sunken_cloth_is_inside(body, rest, standing, name):
     assembly = prepare_scene(Scene((template(name),), (Gravity(),))).assembly
     x = assembly.rest[None].astype(np.float32)
     seen = penetration(assembly, standing, x)
@@ -40,7 +41,7 @@ def test_clothes_at_rest_are_outside_and_sunk_ones_inside(body, rest, standing, 
     assert seen.skin_outside[0] > 0, "and the skin there sticks out"
 
 
-def test_strain_is_that_of_a_scaled_garment():
+def test_edge_strain_of_a_scaled_garment_is_exact():
     assembly = prepare_scene(Scene((template("bottom"),), (Gravity(),))).assembly
     x = np.stack([assembly.rest, 1.1 * assembly.rest])
     strain = edge_strain(assembly, x)
@@ -48,7 +49,7 @@ def test_strain_is_that_of_a_scaled_garment():
     np.testing.assert_allclose(strain[1], 0.1, rtol=1e-9)
 
 
-def test_frames_can_be_chosen(standing):
+def test_penetration_is_measured_at_selected_frames(standing):
     assembly = prepare_scene(Scene((template("bottom"),), (Gravity(),))).assembly
     motion = Motion(
         jnp.repeat(standing.rotations, 3, axis=0), jnp.repeat(standing.root, 3, axis=0), 30.0
@@ -61,7 +62,7 @@ def test_frames_can_be_chosen(standing):
     assert np.isnan(some.skin_outside).all()
 
 
-def test_cloth_within_another_limb_is_inside_and_has_no_room(body, rest):
+def test_cloth_inside_another_limb_is_pinched(body, rest):
     """An arm pressed into the flank: both limbs' cloth is above its own skin, yet inside."""
     g = template("top")
     assembly = prepare_scene(Scene((g,), (Gravity(),))).assembly

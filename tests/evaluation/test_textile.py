@@ -11,8 +11,9 @@ from physxnet_jax.garment import FABRICS
 EDGE = 0.011
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", sorted(FABRICS))
-def test_drape_lies_in_its_published_band(name):
+def test_drape_coefficient_is_in_its_published_range(name):
     low, high, _ = DRAPE_BANDS[name]
     drape = drape_test(FABRICS[name], edge=EDGE, seconds=4.0)
     assert low <= drape.coefficient <= high
@@ -20,8 +21,8 @@ def test_drape_lies_in_its_published_band(name):
     assert drape.speed < 0.3, "nearly at rest"
 
 
-@pytest.mark.slow
-def test_a_board_stays_flat_and_a_rag_hangs_down():
+@pytest.mark.nightly
+def test_stiff_fabric_stays_flat_and_limp_fabric_hangs_down():
     """The controls: the instrument's two ends."""
     stiff = dataclasses.replace(FABRICS["cotton"], bend=1e-2)
     assert drape_test(stiff, edge=EDGE, seconds=1.0).coefficient > 97
@@ -29,7 +30,8 @@ def test_a_board_stays_flat_and_a_rag_hangs_down():
     assert drape_test(limp, edge=EDGE, seconds=4.0).coefficient < 40
 
 
-def test_a_strip_dips_as_its_bending_length_says():
+@pytest.mark.release
+def test_cantilever_measures_the_bending_length():
     cotton = cantilever_test(FABRICS["cotton"], cells=12)
     assert cotton.measured == pytest.approx(cotton.length, rel=0.1)
     # A strip eight times as stiff has twice the bending length, not the same.

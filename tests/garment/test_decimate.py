@@ -35,7 +35,7 @@ def tube(around: int, along: int) -> TriMesh:
     return make_mesh(x[: around * along], once[chart], np.stack([u, v], axis=1), chart)
 
 
-def test_decimation_reaches_the_length_asked_for():
+def test_decimation_reaches_the_requested_edge_length():
     coarse, origin = decimate(sheet(41), 0.1)
     h = mesh_health(coarse)
     assert 0.05 < h.median_edge < 0.2 and h.faces < 400
@@ -46,7 +46,7 @@ def test_decimation_reaches_the_length_asked_for():
     assert (origin == np.arange(len(same.faces))).all()
 
 
-def test_each_face_is_of_the_one_it_lies_on():
+def test_face_origin_is_the_face_it_lies_on():
     fine = sheet(41)
     coarse, origin = decimate(fine, 0.1)
     x, y = np.asarray(fine.vertices), np.asarray(coarse.vertices)
@@ -61,7 +61,7 @@ def test_each_face_is_of_the_one_it_lies_on():
     assert ((origin < len(fine.faces)) == up).all() and 0 < up.sum() < len(up)
 
 
-def test_a_linear_texture_stays_where_it_was():
+def test_linear_texture_is_preserved():
     coarse, _ = decimate(sheet(41, textured=True), 0.1)
     assert coarse.uv is not None and coarse.uv_faces is not None
     corner = np.asarray(coarse.vertices)[np.asarray(coarse.faces)].reshape(-1, 3)
@@ -69,7 +69,7 @@ def test_a_linear_texture_stays_where_it_was():
     assert_allclose(seen, texture(corner), atol=1e-5)
 
 
-def test_no_face_reaches_across_the_seam_of_a_sleeve():
+def test_decimated_faces_do_not_cross_a_texture_seam():
     fine = tube(60, 61)
     coarse, _ = decimate(fine, 0.04)
     assert 4 * len(coarse.faces) < len(fine.faces)

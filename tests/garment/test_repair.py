@@ -33,7 +33,7 @@ def textured(mesh: TriMesh) -> np.ndarray:
     return np.abs(x - np.asarray(mesh.uv)[np.asarray(mesh.uv_faces)]).max()
 
 
-def test_health_counts_what_is_there():
+def test_mesh_health_of_a_clean_sheet_is_exact():
     h = mesh_health(sheet())
     assert (h.vertices, h.faces, h.components) == (25, 32, 1)
     assert h.openings == pytest.approx((4.0,))
@@ -50,7 +50,7 @@ def test_health_counts_what_is_there():
     )
 
 
-def test_each_fault_is_counted_by_its_own_name():
+def test_mesh_health_counts_each_fault_separately():
     whole = sheet()
     x, faces = np.asarray(whole.vertices), np.asarray(whole.faces)
     fin = np.concatenate([x, [[0.5, 0.5, 0.3]]])
@@ -71,7 +71,7 @@ def test_each_fault_is_counted_by_its_own_name():
     assert mesh_health(cases["non_manifold_edges"]).inconsistent_edges == 0
 
 
-def test_vertices_in_one_place_are_welded_without_comparing_all_with_all():
+def test_many_coincident_vertices_are_counted_without_pairwise_comparison():
     x = np.concatenate([np.asarray(sheet().vertices), np.zeros((200_000, 3))])
     crowd = make_mesh(x, np.asarray(sheet().faces))
     assert mesh_health(crowd).coincident_vertices == 200_000
@@ -82,7 +82,7 @@ def test_vertices_in_one_place_are_welded_without_comparing_all_with_all():
         weld(make_mesh(x, np.asarray(sheet().faces)))
 
 
-def test_sheets_that_meet_in_one_edge_are_turned_each_by_itself():
+def test_sheets_sharing_a_non_manifold_edge_are_oriented_independently():
     ball = trimesh.creation.icosphere(2, 1.0)
     body = make_mesh(ball.vertices, ball.faces)
     # Three leaves on one common edge, just outside the sphere; the second is inside out.
@@ -91,8 +91,8 @@ def test_sheets_that_meet_in_one_edge_are_turned_each_by_itself():
     x = np.concatenate([[a, b], tips])
     faces = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])
     for senses in range(8):
-        told = np.array([f[::-1] if senses >> k & 1 else f for k, f in enumerate(faces)])
-        out = np.asarray(orient(make_mesh(x, told), body).faces)
+        reoriented = np.array([f[::-1] if senses >> k & 1 else f for k, f in enumerate(faces)])
+        out = np.asarray(orient(make_mesh(x, reoriented), body).faces)
         corner = x[out]
         normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
         assert (np.einsum("fi,fi->f", normal, corner.mean(axis=1))[:2] > 0).all()
@@ -100,7 +100,7 @@ def test_sheets_that_meet_in_one_edge_are_turned_each_by_itself():
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1000))
-def test_a_torn_mesh_is_welded_and_keeps_its_texture(seed):
+def test_torn_mesh_is_welded_and_keeps_its_texture(seed):
     whole = sheet()
     order = np.random.default_rng(seed).permutation(32)
     mixed = make_mesh(
@@ -116,7 +116,7 @@ def test_a_torn_mesh_is_welded_and_keeps_its_texture(seed):
     np.testing.assert_array_equal(np.asarray(again.vertices), np.asarray(back.vertices))
 
 
-def test_welding_leaves_layers_apart():
+def test_welding_does_not_merge_separate_layers():
     two = np.concatenate(
         [np.asarray(sheet().vertices), np.asarray(sheet().vertices) + [0, 0, 2e-3]]
     )
@@ -125,7 +125,7 @@ def test_welding_leaves_layers_apart():
     assert weld(make_mesh(two, faces), 3e-3).vertices.shape[0] == 25
 
 
-def test_cleaning_takes_what_is_no_cloth():
+def test_cleaning_removes_invalid_faces_and_unused_vertices():
     whole = sheet()
     x = np.concatenate([np.asarray(whole.vertices), [[9.0, 9.0, 9.0]]])
     spoiled = np.concatenate([whole.faces, whole.faces[:2, [1, 2, 0]], whole.faces[:1, [0, 0, 1]]])
@@ -138,7 +138,7 @@ def test_cleaning_takes_what_is_no_cloth():
 
 @settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 1000), share=st.floats(0.0, 1.0))
-def test_faces_are_turned_outwards_whatever_their_sense(seed, share):
+def test_faces_are_oriented_outwards_from_any_winding(seed, share):
     rng = np.random.default_rng(seed)
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.1)
     body = make_mesh(ball.vertices, ball.faces)
@@ -157,7 +157,7 @@ def test_faces_are_turned_outwards_whatever_their_sense(seed, share):
     assert mesh_health(clean(out)).inconsistent_edges == 0
 
 
-def test_subdivision_keeps_shape_and_texture_and_has_an_end():
+def test_subdivision_keeps_shape_and_texture_and_is_bounded():
     for longest in (0.6, 0.4, 0.2):
         fine, part_of = subdivide(sheet(3), longest)
         h = mesh_health(fine)

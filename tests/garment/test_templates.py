@@ -49,7 +49,7 @@ def test_templates_follow_the_shape_parameters(body, name):
         assert np.mean(distance < 0) < 0.01
 
 
-def test_the_asset_is_what_the_code_cuts():
+def test_stored_template_matches_the_built_one():
     """Same topology everywhere; relaxing crossings starts from a threshold, so other
     library versions may move a few vertices of one fold by a few millimetres."""
     built = stored_arrays(build_template("bottom"))
@@ -59,7 +59,7 @@ def test_the_asset_is_what_the_code_cuts():
         assert np.mean(gap > 2e-5) < 0.03 and gap.max() < 5e-3, key
 
 
-def test_a_top_lies_over_trousers_at_rest():
+def test_top_lies_over_trousers_at_rest():
     """Edges of the one cut no triangle of the other; pressed through it would."""
     top, trousers = template("top").mesh, template("bottom").mesh
     count = len(trousers.vertices)
@@ -76,7 +76,7 @@ def test_a_top_lies_over_trousers_at_rest():
 
 
 def test_unknown_templates_are_refused():
-    from physxnet_jax.io import load_garment
+    from physxnet_jax.garment import load_garment
 
     with pytest.raises(MeshError, match="top, bottom, dress"):
         load_garment("hat")
@@ -95,7 +95,7 @@ def area(p, f):
 
 
 @pytest.mark.parametrize("level", [0.13, 0.5, 0.77])
-def test_cutting_a_square_leaves_the_area_below_the_line(level):
+def test_cut_keeps_the_area_below_the_level(level):
     points, quads = plane()
     rows, faces = split_quads(quads, len(points))
     part, tri, _ = cut(rows, faces, (rows @ points)[:, 1] - level)
@@ -106,7 +106,7 @@ def test_cutting_a_square_leaves_the_area_below_the_line(level):
     np.testing.assert_allclose(np.asarray(part.sum(axis=1)).ravel(), 1.0)
 
 
-def test_refining_keeps_the_surface_and_bounds_the_edges():
+def test_refinement_keeps_the_surface_and_bounds_edge_lengths():
     points, quads = plane(4)
     rows, faces = split_quads(quads, len(points))
     rows, faces = refine(rows, faces, points, 0.12)

@@ -12,7 +12,7 @@ from physxnet_jax.errors import MeshError
 from physxnet_jax.geometry import (
     boundary_loops,
     connected_components,
-    greedy_colours,
+    greedy_coloring,
     hinges,
     make_mesh,
     manifold_report,
@@ -34,7 +34,7 @@ _ANGLES = st.tuples(*[st.floats(-3, 3, width=32)] * 3)
 
 @settings(max_examples=40, deadline=None)
 @given(_ANGLES, _ANGLES)
-def test_rotations_agree_with_scipy(a, b):
+def test_rotations_match_scipy(a, b):
     qa, qb = (quaternion_from_axis_angle(jnp.asarray(x, jnp.float32)) for x in (a, b))
     ra, rb = Rotation.from_rotvec(a), Rotation.from_rotvec(b)
     both = matrix_from_quaternion(quaternion_multiply(qa, qb))
@@ -49,7 +49,7 @@ def test_axis_angle_is_smooth_at_zero():
     np.testing.assert_allclose(np.asarray(jacobian), expected, atol=1e-7)
 
 
-def test_polar_rotation_is_the_nearest_rotation_and_finite_when_singular():
+def test_polar_rotation_is_the_nearest_one_and_finite_when_singular():
     rng = np.random.default_rng(0)
     blends = 0.6 * Rotation.random(20, rng).as_matrix()
     near = Rotation.from_rotvec(rng.normal(0, 0.4, (20, 3)))
@@ -62,7 +62,7 @@ def test_polar_rotation_is_the_nearest_rotation_and_finite_when_singular():
     assert bool(jnp.isfinite(slope).all())
 
 
-def test_zero_vectors_have_finite_gradients_and_guards_do_not_bite_elsewhere():
+def test_safe_norms_have_finite_gradients_at_zero_and_are_exact_elsewhere():
     for f in (lambda v: safe_normalize(v).sum(), safe_norm):
         assert bool(jnp.isfinite(jax.grad(f)(jnp.zeros(3))).all())
     tiny = jnp.array([3e-9, 4e-9, 0.0])
@@ -83,7 +83,7 @@ def test_normals_of_slivers_are_finite_with_gradient():
     assert bool(jnp.isfinite(slope).all())
 
 
-def test_topology_of_an_open_cylinder():
+def test_topology_of_an_open_cylinder_is_correct():
     n = 8
     lower = np.arange(n)
     faces = []
@@ -103,17 +103,17 @@ def test_topology_of_an_open_cylinder():
     assert manifold_report(np.concatenate([f, f[:1]]))["duplicate_faces"] == 1
 
 
-def test_colours_share_no_vertex_and_cover_everything():
+def test_color_groups_share_no_vertex_and_cover_all_edges():
     s = trimesh.creation.icosphere(subdivisions=2)
     edges = mesh_edges(s.faces).vertices
-    groups = greedy_colours(edges, len(s.vertices))
+    groups = greedy_coloring(edges, len(s.vertices))
     assert sorted(np.concatenate(groups)) == list(range(len(edges)))
     for g in groups:
         used = edges[g].ravel()
         assert len(np.unique(used)) == len(used)
 
 
-def test_self_intersection_is_found_and_only_where_it_is():
+def test_self_intersections_are_detected_without_false_positives():
     flat = [[0, 0, 0], [1, 0, 0], [0, 1, 0]]
     through = [[0.2, 0.2, -1], [0.2, 0.2, 1], [0.3, 0.9, 1]]
     beside = [[5.2, 0.2, -1], [5.2, 0.2, 1], [5.3, 0.9, 1]]
@@ -131,18 +131,18 @@ def test_self_intersection_is_found_and_only_where_it_is():
         ([[0, 0]], [[0, 0, 0]], "[vertices, 3]"),
     ],
 )
-def test_bad_meshes_are_refused_with_a_sentence(vertices, faces, says):
+def test_invalid_meshes_are_refused_with_a_message(vertices, faces, says):
     with pytest.raises(MeshError, match=says.replace("[", r"\[")):
         make_mesh(vertices, faces)
 
 
 @pytest.mark.parametrize(("corner", "says"), [(-1, "uv -1, but there are 3"), (3, "uv 3, but")])
-def test_a_corner_without_coordinates_is_named(corner, says):
+def test_texture_indices_out_of_range_are_refused(corner, says):
     with pytest.raises(MeshError, match=says):
         make_mesh(np.eye(3), [[0, 1, 2]], np.zeros((3, 2)), [[0, 1, corner]])
 
 
-def test_the_known_miscomputation_of_jax_is_absent():
+def test_known_jax_miscomputation_is_absent():
     """jax-ml/jax#39103: wrong rows in jit(vmap(matvec, reduce)) on CPU."""
     rows = np.random.default_rng(0).normal(size=(36_000, 3)).astype(np.float32)
     turn = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix().astype(np.float32)
@@ -150,14 +150,14 @@ def test_the_known_miscomputation_of_jax_is_absent():
     np.testing.assert_allclose(np.asarray(ours), (rows**2).sum(axis=1), rtol=1e-4)
 
 
-def test_normals_of_a_box_know_nothing_of_its_diagonals():
+def test_box_vertex_normals_do_not_depend_on_the_triangulation():
     """One or two triangles of a side meet in a corner: angles count, not triangles."""
     box = trimesh.creation.box((1, 1, 1))
     n = vertex_normals(jnp.asarray(box.vertices, jnp.float32), jnp.asarray(box.faces, jnp.int32))
     np.testing.assert_allclose(np.asarray(n), np.sign(box.vertices) / np.sqrt(3), atol=1e-5)
 
 
-def test_the_longest_border_comes_first():
+def test_longest_boundary_loop_comes_first():
     faces = np.array([[0, 1, 2], [3, 4, 5], [3, 5, 6]])
     assert [sorted(x.tolist()) for x in boundary_loops(faces)] == [[3, 4, 5, 6], [0, 1, 2]]
     # Two triangles that share a corner: one loop that passes it twice, wherever it begins.

@@ -11,7 +11,7 @@ from physxnet_jax.geometry import (
     closest_among,
     closest_barycentric,
     closest_points,
-    least_index,
+    fast_argmin,
     make_mesh,
     nearby_faces,
     signed_distance,
@@ -23,7 +23,7 @@ _POINT = st.tuples(_COORDINATE, _COORDINATE, _COORDINATE)
 
 @settings(max_examples=60, deadline=None)
 @given(p=_POINT, a=_POINT, b=_POINT, c=_POINT)
-def test_no_sampled_point_of_the_triangle_is_nearer(p, a, b, c):
+def test_closest_point_is_no_farther_than_any_sampled_point(p, a, b, c):
     p, a, b, c = (np.asarray(x, np.float32) for x in (p, a, b, c))
     weights, squared = closest_barycentric(*(jnp.asarray(x)[:, None] for x in (p, a, b, c)))
     w = np.asarray(weights)[:, 0]
@@ -56,8 +56,9 @@ def test_degenerate_triangles_have_finite_value_and_gradient(corners):
     assert float(value) == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("size", [1.0, 1e-3, 1e-5, 1e-8, 1e-12, 0.0])
-def test_gradients_by_the_corners_are_finite_however_small_the_triangle(size):
+def test_gradients_by_corners_are_finite_for_tiny_triangles(size):
     corners = jnp.asarray([[0, 0, 0], [size, 0, 0], [0, size, 0]], jnp.float32)
 
     def distance(corners, p):
@@ -71,7 +72,7 @@ def test_gradients_by_the_corners_are_finite_however_small_the_triangle(size):
         assert abs(float(value) ** 0.5 - nearest) <= 1.01 * size + 1e-6
 
 
-def test_signed_distance_of_a_sphere():
+def test_signed_distance_of_a_sphere_is_accurate():
     s = trimesh.creation.icosphere(subdivisions=4)
     mesh = make_mesh(s.vertices, s.faces)
     points = np.random.default_rng(0).uniform(-1.5, 1.5, (400, 3)).astype(np.float32)
@@ -80,7 +81,7 @@ def test_signed_distance_of_a_sphere():
     np.testing.assert_allclose(ours, expected, atol=3e-3)
 
 
-def test_signs_are_right_in_front_of_edges_and_corners_of_a_box():
+def test_signs_are_correct_near_edges_and_corners_of_a_box():
     box = trimesh.creation.box((1, 1, 1))
     mesh = make_mesh(box.vertices, box.faces)
     points = np.random.default_rng(1).uniform(-1, 1, (500, 3)).astype(np.float32)
@@ -89,7 +90,7 @@ def test_signs_are_right_in_front_of_edges_and_corners_of_a_box():
     assert ((ours < 0) == inside).all()
 
 
-def test_candidates_find_what_brute_force_finds(body):
+def test_candidate_search_matches_brute_force(body):
     mesh = body.rest_mesh()
     rng = np.random.default_rng(2)
     v = np.asarray(mesh.vertices)
@@ -103,15 +104,16 @@ def test_candidates_find_what_brute_force_finds(body):
     assert (miss > 1e-5).mean() < 0.01 and miss.max() < 2e-3
 
 
-def test_the_least_index_is_that_of_argmin():
+def test_fast_argmin_matches_argmin():
     rng = np.random.default_rng(3)
     values = rng.integers(0, 5, (200, 7)).astype(np.float32)
     values[0] = np.inf
-    np.testing.assert_array_equal(np.asarray(least_index(jnp.asarray(values))), values.argmin(1))
-    assert int(least_index(jnp.full((1, 7), jnp.nan))[0]) == 6
+    np.testing.assert_array_equal(np.asarray(fast_argmin(jnp.asarray(values))), values.argmin(1))
+    assert int(fast_argmin(jnp.full((1, 7), jnp.nan))[0]) == 6
 
 
-def test_the_distance_falls_along_its_gradient(body):
+@pytest.mark.release
+def test_distance_gradient_points_away_from_the_closest_point(body):
     """Derivatives go through the triangle that was taken, as of the exact search."""
     mesh = body.rest_mesh()
     v = np.asarray(mesh.vertices)
@@ -130,7 +132,7 @@ def test_the_distance_falls_along_its_gradient(body):
 
 
 @pytest.mark.parametrize("size", [1e-2, 1e-3, 1e-4])
-def test_the_foot_on_a_small_triangle_lies_within_it(size):
+def test_closest_point_on_a_small_triangle_is_inside_it(size):
     """Only what has no area to speak of counts as a line: a millimetre of cloth has one."""
     corners = jnp.asarray([[0, 0, 0], [size, 0, 0], [0, size, 0]], jnp.float32)
     p = jnp.asarray([0.25 * size, 0.25 * size, size], jnp.float32)
@@ -139,7 +141,7 @@ def test_the_foot_on_a_small_triangle_lies_within_it(size):
     assert float(squared[0]) == pytest.approx(size**2, rel=1e-3)
 
 
-def test_signs_are_right_in_front_of_a_sharp_edge():
+def test_signs_are_correct_near_a_sharp_edge():
     """Beyond the edge of a wedge a point lies behind the plane of one of its sides."""
     wedge = trimesh.Trimesh(
         [[0, 0, 0], [0, 0, 1], [1, 0.1, 0.5], [1, -0.1, 0.5]],

@@ -23,11 +23,11 @@ def rings(p):
     return [p.corners[a : a + n].tolist() for a, n in zip(p.starts, p.counts)]
 
 
-def test_triangles_know_their_polygon():
+def test_triangles_map_to_their_polygon():
     assert house().of_triangle.tolist() == [0, 0, 1, 2, 2, 2]
 
 
-def test_equal_contents_are_equal_and_share_one_trace():
+def test_equal_polygons_compare_equal_and_share_one_trace():
     traced = []
 
     @jax.jit(static_argnums=1)
@@ -50,7 +50,7 @@ def test_equal_contents_are_equal_and_share_one_trace():
     assert len(traced) == 2
 
 
-def test_chosen_turned_round_and_renumbered():
+def test_polygons_can_be_selected_reversed_and_renumbered():
     p = house(uv_corners=np.arange(12, dtype=np.int32))
     some = p.chosen([2, 0])
     assert rings(some) == [[0, 3, 4, 5, 6], [0, 1, 2, 3]] and some.material.tolist() == [-1, 0]
@@ -66,7 +66,7 @@ def test_chosen_turned_round_and_renumbered():
     assert len(p.chosen([]).counts) == 0
 
 
-def test_several_meshes_share_materials_of_one_name_and_colour():
+def test_joined_meshes_share_materials_of_equal_name_and_colour():
     both = joined_polygons(
         [(house(), 7, 0), (house(materials=(Material("roof"), *house().materials[1:])), 7, 0)]
     )
@@ -92,5 +92,5 @@ def test_several_meshes_share_materials_of_one_name_and_colour():
         (["a", "b", "c"], None),
     ],
 )
-def test_colours_are_three_numbers_or_none(told, colour):
+def test_material_colours_are_three_numbers_or_none(told, colour):
     assert make_material("m", told).colour == colour

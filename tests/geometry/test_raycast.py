@@ -34,7 +34,7 @@ def test_random_rays_from_inside_never_leak(sphere):
     assert bool(hits.valid.all())
 
 
-def test_agrees_with_embree_on_100_000_random_rays(sphere):
+def test_hits_match_embree_on_100_000_random_rays(sphere):
     """The two differ only where a ray grazes an edge: by rounding."""
     mesh = trimesh.Trimesh(np.asarray(sphere.vertices), np.asarray(sphere.faces), process=False)
     rng = np.random.default_rng(1)
@@ -59,7 +59,7 @@ def test_agrees_with_embree_on_100_000_random_rays(sphere):
         assert (gap / np.linalg.norm(normal, axis=1)).min() < 1e-4
 
 
-def test_both_directions_take_the_nearer_hit():
+def test_bidirectional_rays_take_the_nearer_hit():
     mesh = make_mesh(
         [[-1, -1, 1], [1, -1, 1], [0, 1, 1], [-1, -1, -3], [1, -1, -3], [0, 1, -3]],
         [[0, 1, 2], [3, 4, 5]],
@@ -72,7 +72,7 @@ def test_both_directions_take_the_nearer_hit():
     assert int(two_way.face[0]) == 0
 
 
-def test_degenerate_triangles_and_zero_directions_hit_nothing_and_stay_finite():
+def test_degenerate_triangles_and_zero_directions_are_finite_misses():
     mesh = make_mesh(
         [[0, 0, 1], [1, 0, 1], [2, 0, 1], [0, 0, 1]], [[0, 1, 2], [0, 3, 1], [0, 0, 0]]
     )
@@ -82,13 +82,13 @@ def test_degenerate_triangles_and_zero_directions_hit_nothing_and_stay_finite():
     assert bool(jnp.isfinite(hits.weights).all())
 
 
-def test_a_guard_on_distance_does_not_remove_nearer_hits(sphere):
+def test_max_distance_does_not_remove_nearer_hits(sphere):
     origin, ray = jnp.zeros((1, 3)), jnp.array([[1.0, 0.2, 0.1]])
     assert not bool(cast_rays(sphere, origin, ray, max_distance=0.5).valid[0])
     assert bool(cast_rays(sphere, origin, ray, max_distance=1.1).valid[0])
 
 
-def test_rigid_motion_changes_nothing(sphere):
+def test_hit_distances_are_invariant_to_rigid_motion(sphere):
     rng = np.random.default_rng(2)
     origins = rng.uniform(-0.3, 0.3, (200, 3)).astype(np.float32)
     directions = rng.normal(size=origins.shape).astype(np.float32)
@@ -100,7 +100,7 @@ def test_rigid_motion_changes_nothing(sphere):
     np.testing.assert_allclose(np.asarray(a.distance), np.asarray(b.distance), atol=1e-5)
 
 
-def test_gradient_of_the_distance_is_finite_and_right(sphere):
+def test_gradient_of_the_distance_is_finite_and_correct(sphere):
     def height(z):
         origin = jnp.stack([jnp.float32(0.05), jnp.float32(0.02), z])[None]
         return cast_rays(sphere, origin, jnp.array([[0.0, 0.0, 1.0]])).distance[0]

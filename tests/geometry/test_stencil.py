@@ -15,7 +15,7 @@ def sheet(n, step=0.01):
     return v, np.concatenate([np.column_stack([a, b, c]), np.column_stack([b, d, c])])
 
 
-def test_constants_stay_and_noise_shrinks():
+def test_stencil_keeps_constants_and_reduces_noise():
     v, f = sheet(20)
     s = gaussian_stencil(v, f, 0.03)
     np.testing.assert_allclose(np.asarray(s.weight.sum(axis=1)), 1.0, atol=1e-6)
@@ -25,7 +25,7 @@ def test_constants_stay_and_noise_shrinks():
     assert float(jnp.std(s @ (s @ jnp.asarray(noise)))) < 0.3
 
 
-def test_a_batch_is_a_loop_over_its_members():
+def test_batched_stencil_matches_a_loop():
     v, f = sheet(8)
     s = gaussian_stencil(v, f, 0.02)
     x = jnp.asarray(np.random.default_rng(1).normal(size=(4, len(v), 3)).astype(np.float32))
@@ -33,7 +33,7 @@ def test_a_batch_is_a_loop_over_its_members():
     np.testing.assert_allclose(np.asarray(s @ x), np.asarray(each), atol=1e-6)
 
 
-def test_another_sheet_close_by_takes_no_part():
+def test_nearby_disconnected_sheet_is_excluded():
     v, f = sheet(6)
     both = np.concatenate([v, v + [0.0, 0.0, 0.001]])
     s = gaussian_stencil(both, np.concatenate([f, f + len(v)]), 0.03)
@@ -41,7 +41,7 @@ def test_another_sheet_close_by_takes_no_part():
     np.testing.assert_allclose(np.asarray(s @ values), np.asarray(values), atol=1e-6)
 
 
-def test_lonely_vertices_keep_their_value_and_coincident_ones_share_it():
+def test_isolated_vertices_keep_values_and_coincident_ones_share_them():
     v = np.zeros((4, 3))
     s = gaussian_stencil(v, np.array([[0, 1, 2]]), 0.01)
     out = np.asarray(s @ jnp.asarray([[0.0], [3.0], [6.0], [9.0]]))
@@ -50,7 +50,7 @@ def test_lonely_vertices_keep_their_value_and_coincident_ones_share_it():
 
 
 @pytest.mark.parametrize("step", [0.02, 0.01, 0.004])
-def test_smoothing_leaves_no_lumps_however_fine_the_mesh(step):
+def test_smoothing_is_smooth_at_any_mesh_resolution(step):
     v, f = sheet(24, step)
     smoothing = gaussian_smoothing(v, f, 0.03)
     assert len(smoothing.stencils) <= 5
@@ -66,14 +66,14 @@ def test_smoothing_leaves_no_lumps_however_fine_the_mesh(step):
     assert lumps(smoothing @ noise) < 0.6 * lumps(alone @ (alone @ noise))
 
 
-def test_smoothing_no_wider_than_the_mesh_is_one_stencil():
+def test_smoothing_at_mesh_resolution_is_one_stencil():
     v, f = sheet(12, 0.02)
     (only,) = gaussian_smoothing(v, f, 0.015).stencils
     np.testing.assert_array_equal(only.index, gaussian_stencil(v, f, 0.015).index)
 
 
 @pytest.mark.parametrize("spacing", [0.05, 0.3])
-def test_spread_points_are_apart_and_cover_the_rest(spacing):
+def test_spread_points_are_separated_and_cover_all_points(spacing):
     p = np.random.default_rng(2).uniform(size=(300, 3))
     chosen = p[spread_points(p, spacing)]
     gaps = np.linalg.norm(chosen[:, None] - chosen[None], axis=2) + np.eye(len(chosen))

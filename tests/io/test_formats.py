@@ -61,7 +61,7 @@ def accessor(document: dict, blob: bytes, number: int) -> np.ndarray:
     return data
 
 
-def test_gltf_plays_the_clip(tmp_path, clip):
+def test_gltf_morph_targets_reproduce_the_clip(tmp_path, clip):
     pytest.importorskip("pygltflib")
     (path,) = write_clip(tmp_path / "a.glb", clip, 25.0)
     document, blob = read_glb(path)
@@ -92,7 +92,7 @@ def test_gltf_plays_the_clip(tmp_path, clip):
             np.testing.assert_allclose(chart[index], expected, atol=1e-6)
 
 
-def test_gltf_is_what_trimesh_reads(tmp_path, clip):
+def test_trimesh_reads_the_gltf_meshes(tmp_path, clip):
     pytest.importorskip("pygltflib")
     (path,) = write_clip(tmp_path / "a.glb", clip, 25.0)
     scene = trimesh.load(path)
@@ -103,7 +103,7 @@ def test_gltf_is_what_trimesh_reads(tmp_path, clip):
     )
 
 
-def test_gltf_refuses_clips_that_no_viewer_would_hold(tmp_path, monkeypatch, capsys):
+def test_gltf_refuses_clips_with_too_many_frames(tmp_path, monkeypatch, capsys):
     long = np.zeros((MAX_FRAMES + 1, 3, 3), np.float32)
     with pytest.raises(FormatError, match="too many for glTF"):
         write_clip(tmp_path / "a.glb", [AnimatedMesh("a", long, np.array([[0, 1, 2]]))], 30.0)
@@ -115,7 +115,7 @@ def test_gltf_refuses_clips_that_no_viewer_would_hold(tmp_path, monkeypatch, cap
     assert "too many for glTF" in capsys.readouterr().err
 
 
-def test_one_frame_is_a_still(tmp_path, clip):
+def test_one_frame_gltf_has_no_animation(tmp_path, clip):
     pytest.importorskip("pygltflib")
     still = [AnimatedMesh(m.name, m.positions[:1], m.faces) for m in clip]
     (path,) = write_clip(tmp_path / "a.glb", still, 30.0)
@@ -123,7 +123,7 @@ def test_one_frame_is_a_still(tmp_path, clip):
     assert not document.get("animations")
 
 
-def test_mdd_is_the_format_of_its_description(tmp_path, clip):
+def test_mdd_layout_matches_its_specification(tmp_path, clip):
     files = write_clip(tmp_path / "a.mdd", clip, 24.0)
     assert [f.name for f in files] == [
         "a_shirt.mdd",
@@ -141,7 +141,7 @@ def test_mdd_is_the_format_of_its_description(tmp_path, clip):
     assert times[-1] == pytest.approx(4 / 24)
 
 
-def test_obj_sequences_have_a_file_a_frame(tmp_path, clip):
+def test_obj_sequences_have_one_file_per_frame(tmp_path, clip):
     files = write_clip(tmp_path / "a.obj", clip, 24.0)
     assert len(files) == 10 and files[3].name == "a_shirt_0003.obj"
     mesh = trimesh.load(files[8], process=False, force="mesh", maintain_order=True)
@@ -167,7 +167,7 @@ def test_broken_mdd_files_are_refused(tmp_path_factory, blob, cut):
             read_mdd(path)
 
 
-def test_a_header_that_promises_too_much_costs_nothing(tmp_path):
+def test_oversized_mdd_headers_are_refused_as_truncated(tmp_path):
     path = tmp_path / "huge.mdd"
     path.write_bytes(struct.pack(">ii", 2**31 - 1, 2**31 - 1) + b"\0" * 64)
     with pytest.raises(FormatError, match="truncated"):
@@ -182,7 +182,7 @@ def area_normals(x, faces):
     return n / np.linalg.norm(n, axis=1, keepdims=True)
 
 
-def test_gltf_lights_every_frame_by_its_own_normals(tmp_path, clip):
+def test_gltf_morph_targets_include_the_normals_of_each_frame(tmp_path, clip):
     """Morph targets add to the mesh's normals as they do to its points."""
     pytest.importorskip("pygltflib")
     (path,) = write_clip(tmp_path / "a.glb", clip, 25.0)

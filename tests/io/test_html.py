@@ -30,10 +30,10 @@ def page(tmp_path):
     return path
 
 
-def test_it_holds_all_it_needs(page):
+def test_html_page_is_self_contained_and_escaped(page):
     text = page.read_text(encoding="utf-8")
-    told = json.loads(re.search(r'id="told" type="application/json">(.*?)</script>', text)[1])
-    assert told["frames"] == 3 and list(told["meshes"]) == ["grows</script>", "stays"]
+    data = json.loads(re.search(r'id="data" type="application/json">(.*?)</script>', text)[1])
+    assert data["frames"] == 3 and list(data["meshes"]) == ["grows</script>", "stays"]
     assert "<title>a &lt;b&gt;</title>" in text
     # One element of each kind opens and closes: no text breaks out of its own.
     assert len(re.findall(r"<script\b", text)) >= len(re.findall(r"</script>", text)) == 3
@@ -44,7 +44,7 @@ def test_it_holds_all_it_needs(page):
 
 @pytest.mark.browser
 @pytest.mark.skipif(_BROWSER["BROWSER"] is None, reason="no Chromium installed")
-def test_it_plays_in_a_browser(page, tmp_path):
+def test_html_page_plays_in_a_browser(page, tmp_path):
     tab = _BROWSER["Page"]("about:blank", tmp_path / "profile", (480, 360))
 
     def red(fragment: str, enough) -> int:

@@ -14,23 +14,18 @@ import trimesh
 from safetensors.numpy import load, save
 
 from physxnet_jax.errors import FormatError, MeshError, WeightsError
-from physxnet_jax.garment import template
-from physxnet_jax.io import (
-    AnimatedMesh,
+from physxnet_jax.garment import load_garment, template
+from physxnet_jax.io import AnimatedMesh, read_obj, read_pc2, write_clip, write_obj, write_pc2
+from physxnet_jax.models import (
+    fold_batch_norm,
     list_weights,
-    load_garment,
     load_predictor,
     read_card,
-    read_obj,
-    read_pc2,
     save_mean,
     save_predictor,
     weights_size,
-    write_clip,
-    write_obj,
-    write_pc2,
+    with_mirror_tta,
 )
-from physxnet_jax.models import ask_mirrored, fold_batch_norm
 
 QUAD = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
 
@@ -48,7 +43,7 @@ def clip():
     ]
 
 
-def test_usd_is_read_back_with_rate_axis_unit_uv_normals_and_velocities(tmp_path, clip):
+def test_usd_preserves_rate_axis_unit_uv_normals_and_velocities(tmp_path, clip):
     usd = pytest.importorskip("pxr.Usd")
     from pxr import UsdGeom, UsdShade
 
@@ -100,13 +95,13 @@ def test_pc2_and_obj_keep_the_vertex_order(tmp_path, clip):
     np.testing.assert_allclose(ours.uv[ours.uv_faces], clip[0].uv[clip[0].uv_faces], atol=1e-5)
 
 
-def test_npz_needs_no_pickle(tmp_path, clip):
+def test_npz_is_readable_without_pickle(tmp_path, clip):
     (path,) = write_clip(tmp_path / "a.npz", clip, 30.0)
     with np.load(path, allow_pickle=False) as data:
         np.testing.assert_array_equal(data["2020_shirt_x_positions"], clip[1].positions)
 
 
-def test_a_shorter_sequence_leaves_no_frames_of_a_longer_one(tmp_path, clip):
+def test_shorter_sequence_removes_stale_frames_of_a_longer_one(tmp_path, clip):
     one = [dataclasses.replace(clip[0], name="a")]
     write_clip(tmp_path / "c.obj", one, 30.0)
     (tmp_path / "c_a_0099.obj").write_text("mine")
@@ -116,7 +111,7 @@ def test_a_shorter_sequence_leaves_no_frames_of_a_longer_one(tmp_path, clip):
     assert left == ["c_a_0000.obj", "c_a_0001.obj", "c_a_0099.obj"]
 
 
-def test_names_that_no_file_may_have_are_mended(tmp_path, clip):
+def test_invalid_file_name_characters_are_replaced(tmp_path, clip):
     odd = [dataclasses.replace(clip[0], name="coat/..\\a:b")]
     for suffix in (".pc2", ".obj", ".npz", ".usda", ".glb"):
         for path in write_clip(tmp_path / "in" / f"c{suffix}", odd, 30.0):
@@ -124,7 +119,7 @@ def test_names_that_no_file_may_have_are_mended(tmp_path, clip):
     assert (tmp_path / "in/c_coat_.._a_b.pc2").is_file()
 
 
-def test_unknown_extensions_and_truncated_caches_are_refused_and_leave_nothing(tmp_path, clip):
+def test_unknown_extensions_and_truncated_caches_are_refused(tmp_path, clip):
     with pytest.raises(FormatError, match=r"\.usdc"):
         write_clip(tmp_path / "a.abc", clip, 30.0)
     write_pc2(tmp_path / "a.pc2", clip[0].positions)
@@ -160,7 +155,7 @@ def test_broken_obj_files_are_refused(tmp_path, text, says):
         read_obj(path)
 
 
-def test_quads_split_along_the_shorter_diagonal_and_negative_indices_count_back(tmp_path):
+def test_quads_split_at_the_shorter_diagonal_and_negative_indices_work(tmp_path):
     path = tmp_path / "a.obj"
     path.write_text("v 0 0 0\nv 3 0 0\nv 4 1 0\nv 1 1 0\nf -4 -3 -2 -1\n")
     mesh = read_obj(path)
@@ -169,7 +164,7 @@ def test_quads_split_along_the_shorter_diagonal_and_negative_indices_count_back(
 
 
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 0.01), ("dm", 0.1), ("mm", 0.001)])
-def test_units_and_axes_are_found(tmp_path, unit, scale):
+def test_units_and_axes_are_detected(tmp_path, unit, scale):
     g = template("bottom")
     v = np.asarray(g.mesh.vertices) / scale
     write_obj(tmp_path / "y.obj", v, np.asarray(g.mesh.faces))
@@ -208,7 +203,7 @@ def test_real_garments_load_on_the_body(data_dir, name, kind):
     assert np.mean(distance < -1e-3) < 0.02
 
 
-def test_meshes_that_are_nowhere_near_a_body_are_refused(tmp_path):
+def test_meshes_far_from_the_body_are_refused(tmp_path):
     rng = np.random.default_rng(0)
     write_obj(tmp_path / "a.obj", rng.uniform(50, 60, (30, 3)), np.arange(30).reshape(10, 3))
     with pytest.raises(MeshError, match="no unit and up axis"):
@@ -217,9 +212,9 @@ def test_meshes_that_are_nowhere_near_a_body_are_refused(tmp_path):
         load_garment(tmp_path / "a.fbx")
 
 
-def test_a_mean_of_networks_names_what_it_averages(tmp_path):
-    pair, parts = load_predictor("pair+mirror"), ("local", "local-muon")
-    assert pair.mirrored and read_card("pair")["mean_of"] == list(parts)
+def test_averaged_networks_list_their_members(tmp_path):
+    pair, parts = with_mirror_tta(load_predictor("pair")), ("local", "local-muon")
+    assert pair.mirror_tta and read_card("pair")["mean_of"] == list(parts)
     assert weights_size("pair") == sum(map(weights_size, parts))
     save_mean(tmp_path / "pair", parts, card={"licence": "as theirs"})
     assert weights_size(tmp_path / "pair") == weights_size("pair")
@@ -238,24 +233,24 @@ def test_a_mean_of_networks_names_what_it_averages(tmp_path):
 
 def test_loading_weights_draws_no_random_numbers():
     """As a fresh process has it: what is drawn is compiled first, which takes seconds."""
-    code = "from physxnet_jax.io import load_predictor; load_predictor('nano')"
-    told = subprocess.run(
+    code = "from physxnet_jax.models import load_predictor; load_predictor('nano')"
+    completed = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
         text=True,
         env={**os.environ, "JAX_LOG_COMPILES": "1"},
     )
-    assert told.returncode == 0, told.stderr[-2000:]
-    assert "Compiling jit(" in told.stderr and "truncated_normal" not in told.stderr
+    assert completed.returncode == 0, completed.stderr[-2000:]
+    assert "Compiling jit(" in completed.stderr and "truncated_normal" not in completed.stderr
 
 
-def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
+def test_packaged_weights_load_and_damage_is_detected(tmp_path):
     assert list_weights() == ["local", "local-muon", "nano", "pair", "paper", "small"]
     predictor = load_predictor("local")
     assert read_card("local")["model"]["inputs"]["family"] == "local"
     for other, says in (
         (fold_batch_norm(predictor), "folded"),
-        (ask_mirrored(predictor), "with \\+mirror"),
+        (with_mirror_tta(predictor), "test-time augmentation"),
     ):
         with pytest.raises(WeightsError, match=says):
             save_predictor(tmp_path / "w", other, name="copy")
@@ -296,7 +291,7 @@ def test_packaged_weights_load_and_damage_is_noticed(tmp_path):
         load_predictor("second")
 
 
-def test_usd_tells_normals_extent_and_velocities_of_every_frame(tmp_path, clip):
+def test_usd_stores_normals_extent_and_velocities_of_every_frame(tmp_path, clip):
     usd = pytest.importorskip("pxr.Usd")
     from pxr import UsdGeom
 

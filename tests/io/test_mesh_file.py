@@ -8,17 +8,10 @@ import pytest
 import trimesh
 from scipy.spatial import KDTree
 
+from physxnet_jax.dressing import inspect_garment
 from physxnet_jax.errors import FormatError, PhysXNetError
-from physxnet_jax.garment import template
-from physxnet_jax.io import (
-    GARMENT_FORMATS,
-    AnimatedMesh,
-    inspect_garment,
-    load_garment,
-    read_mesh,
-    write_clip,
-    write_obj,
-)
+from physxnet_jax.garment import load_garment, template
+from physxnet_jax.io import GARMENT_FORMATS, AnimatedMesh, read_mesh, write_clip, write_obj
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +46,7 @@ def saved(folder, suffix, trousers):
 
 
 @pytest.mark.parametrize("suffix", [s for s in GARMENT_FORMATS if s not in (".gltf", ".usd")])
-def test_every_format_holds_the_same_mesh(suffix, trousers, tmp_path):
+def test_all_formats_give_the_same_mesh(suffix, trousers, tmp_path):
     v, faces, uv, uv_faces = trousers
     mesh = read_mesh(saved(tmp_path, suffix, trousers))
     assert mesh.vertices.shape == v.shape, "what lies on a seam is one vertex"
@@ -65,7 +58,7 @@ def test_every_format_holds_the_same_mesh(suffix, trousers, tmp_path):
         np.testing.assert_allclose(mesh.uv[mesh.uv_faces], uv[uv_faces], atol=1e-5)
 
 
-def test_worn_it_is_the_garment_that_the_obj_is(trousers, tmp_path):
+def test_glb_garment_matches_the_obj_garment(trousers, tmp_path):
     wanted, _ = load_garment(saved(tmp_path, ".obj", trousers))
     garment, report = load_garment(saved(tmp_path, ".glb", trousers))
     assert (report.unit, report.up, report.template) == ("m", "Y", "bottom")
@@ -76,7 +69,7 @@ def test_worn_it_is_the_garment_that_the_obj_is(trousers, tmp_path):
     assert garment.name == "trousers"
 
 
-def test_a_mesh_without_seams_keeps_its_order(trousers, tmp_path):
+def test_mesh_without_seams_keeps_its_vertex_order(trousers, tmp_path):
     v, faces, _, _ = trousers
     trimesh.Trimesh(v, faces, process=False).export(tmp_path / "a.ply")
     write_clip(tmp_path / "a.usda", [AnimatedMesh("a", v[None], faces)], 30.0)
@@ -86,8 +79,9 @@ def test_a_mesh_without_seams_keeps_its_order(trousers, tmp_path):
         np.testing.assert_array_equal(mesh.faces, faces)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("suffix", [".glb", ".usda"])
-def test_one_of_several_meshes_is_taken_by_its_name(suffix, trousers, tmp_path):
+def test_one_of_several_meshes_is_selected_by_name(suffix, trousers, tmp_path):
     v, faces, _, _ = trousers
     person = AnimatedMesh("person", v[None] + np.float32(0.3), faces[:40])
     path = tmp_path / f"both{suffix}"
@@ -95,7 +89,7 @@ def test_one_of_several_meshes_is_taken_by_its_name(suffix, trousers, tmp_path):
     both, one = read_mesh(path), read_mesh(f"{path}#trousers")
     assert both.parts == ("person", "trousers") and one.parts == ("trousers",)
     assert len(both.faces) == len(faces) + 40 and len(one.faces) == len(faces)
-    assert load_garment(f"{path}#trousers=bottom")[0].name == "both_trousers"
+    assert load_garment(f"{path}#trousers:as=bottom")[0].name == "both_trousers"
     with pytest.raises(FormatError, match="no mesh 'hat'; there are person, trousers"):
         read_mesh(f"{path}#hat")
     if suffix == ".usda":
@@ -105,7 +99,7 @@ def test_one_of_several_meshes_is_taken_by_its_name(suffix, trousers, tmp_path):
     assert not any("meshes" in n for n in inspect_garment(f"{path}#trousers").notes)
 
 
-def test_a_rigged_mesh_is_read_as_it_was_bound(tmp_path):
+def test_rigged_mesh_is_read_in_its_bind_pose(tmp_path):
     """Where its node stands now, and how its joints have been turned, says nothing of it."""
     text = """#usda 1.0
 (
@@ -136,8 +130,8 @@ def SkelRoot "person"
     np.testing.assert_array_equal(mesh.uv[mesh.uv_faces][..., 0], [[0, 1, 1], [0, 1, 0], [1, 0, 1]])
 
 
-def test_what_is_no_garment_is_refused(trousers, tmp_path):
-    for name, blob, told in (
+def test_files_without_a_valid_mesh_are_refused(trousers, tmp_path):
+    for name, blob, message in (
         ("a.fbx", b"Kaydara FBX Binary", "'.fbx'"),
         ("a.ply", b"ply\nformat binary_little_endian 1.0\n", "not a mesh"),
         ("b.ply", saved(tmp_path, ".ply", trousers).read_bytes()[:-9], "not a mesh"),
@@ -145,7 +139,7 @@ def test_what_is_no_garment_is_refused(trousers, tmp_path):
         ("a.usda", b"#usda 1.0\n", "no mesh in it"),
     ):
         (tmp_path / name).write_bytes(blob)
-        with pytest.raises(FormatError, match=told):
+        with pytest.raises(FormatError, match=message):
             read_mesh(tmp_path / name)
     with pytest.raises(FormatError, match="no such file"):
         read_mesh(tmp_path / "none.glb")
@@ -159,7 +153,7 @@ def test_what_is_no_garment_is_refused(trousers, tmp_path):
         load_garment("hat")
 
 
-def test_a_flat_shaded_stl_becomes_one_sheet(trousers, tmp_path):
+def test_flat_shaded_stl_is_welded_into_one_component(trousers, tmp_path):
     """Every triangle of an STL has corners of its own."""
     v, faces, _, _ = trousers
     trimesh.Trimesh(v, faces, process=False).export(tmp_path / "a.stl")
@@ -167,7 +161,7 @@ def test_a_flat_shaded_stl_becomes_one_sheet(trousers, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["scale", "matrix", "usda"])
-def test_what_a_file_mirrors_has_its_outside_out(tmp_path, kind):
+def test_mirrored_transforms_keep_faces_pointing_outwards(tmp_path, kind):
     """A ball mirrored by its node or prim still encloses what is in it."""
     ball = trimesh.creation.icosphere(subdivisions=1)
     x, faces = np.asarray(ball.vertices, "<f4") + np.float32([2, 0, 0]), np.asarray(ball.faces)

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from physxnet_jax import fit_garment, inspect_garment, template
+from physxnet_jax.garment import load_garment
 from physxnet_jax.geometry import Texture, make_texture
-from physxnet_jax.io import AnimatedMesh, load_garment, read_mesh, read_obj, write_clip
-from physxnet_jax.io._chart import make_move
+from physxnet_jax.io import AnimatedMesh, read_mesh, read_obj, write_clip
 from physxnet_jax.io._texture import texture_beside, write_textures
+from physxnet_jax.io._uv_transform import make_uv_transform
 
 imageio = pytest.importorskip("imageio.v2")
 
@@ -74,7 +75,7 @@ def images(mesh):
     return [None if m.texture is None else m.texture.data for m in mesh.polygons.materials]
 
 
-def test_an_obj_is_read_with_the_images_that_its_materials_name(painted):
+def test_obj_images_of_materials_are_read(painted):
     p = read_obj(painted).polygons
     assert p is not None and images(read_obj(painted)) == [RED, BLUE]
     assert [m.texture and m.texture.name for m in p.materials] == ["red cloth.png", "blue.png"]
@@ -83,7 +84,7 @@ def test_an_obj_is_read_with_the_images_that_its_materials_name(painted):
 
 
 @pytest.mark.parametrize("suffix", [".usda", ".usdc", ".obj", ".pc2", ".glb"])
-def test_what_is_written_has_the_images_again(painted, tmp_path, suffix):
+def test_images_survive_writing(painted, tmp_path, suffix):
     mesh = worn(painted)
     assert mesh.polygons is not None
     out = tmp_path / "out"
@@ -102,7 +103,7 @@ def test_what_is_written_has_the_images_again(painted, tmp_path, suffix):
     np.testing.assert_allclose(back.uv[back.uv_faces], mesh.uv[mesh.uv_faces], atol=1e-5)
 
 
-def test_other_readers_find_them(painted, tmp_path):
+def test_other_readers_find_the_images(painted, tmp_path):
     trimesh, usd = pytest.importorskip("trimesh"), pytest.importorskip("pxr.Usd")
     shade = pytest.importorskip("pxr.UsdShade")
     mesh = worn(painted)
@@ -127,7 +128,7 @@ def test_other_readers_find_them(painted, tmp_path):
     assert sorted(pathlib.Path(f).read_bytes() for f in files) == sorted([RED, BLUE])
 
 
-def test_a_page_has_them_within(painted, tmp_path):
+def test_html_page_embeds_the_images(painted, tmp_path):
     write_clip(tmp_path / "a.html", [worn(painted)], 30.0)
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     told = json.loads(text.split('type="application/json">')[1].split("</script>")[0])
@@ -136,7 +137,7 @@ def test_a_page_has_them_within(painted, tmp_path):
     assert [p.name for p in tmp_path.iterdir() if p.is_file()] == ["a.html"]
 
 
-def test_one_image_of_two_materials_is_written_once(painted, tmp_path):
+def test_image_shared_by_two_materials_is_written_once(painted, tmp_path):
     mesh = worn(painted)
     assert mesh.polygons is not None
     one, two = mesh.polygons.materials
@@ -155,7 +156,7 @@ def test_one_image_of_two_materials_is_written_once(painted, tmp_path):
     ]
 
 
-def test_a_tint_is_multiplied_and_comes_back(painted, tmp_path):
+def test_texture_tint_round_trips(painted, tmp_path):
     mesh = worn(painted)
     assert mesh.polygons is not None
     tint = (0.5, 0.25, 1.0)
@@ -168,13 +169,14 @@ def test_a_tint_is_multiplied_and_comes_back(painted, tmp_path):
         assert all(m.colour == pytest.approx(tint) for m in back.polygons.materials)
 
 
-def test_a_fitted_garment_keeps_them_however_fine(painted, tmp_path):
+@pytest.mark.release
+def test_fitting_keeps_images_at_any_resolution(painted, tmp_path):
     for name, edge in (("a.obj", None), ("b.obj", 0.02)):
         fit_garment(painted, tmp_path / name, edge_length=edge)
         assert images(read_obj(tmp_path / name)) == [RED, BLUE]
 
 
-def test_without_coordinates_there_is_a_colour_alone(painted):
+def test_mesh_without_texture_coordinates_has_only_a_colour(painted):
     mesh = worn(painted)
     bare = dataclasses.replace(mesh, uv=None, uv_faces=None)
     assert [look.texture for look in bare.looks] == [None, None]
@@ -182,7 +184,7 @@ def test_without_coordinates_there_is_a_colour_alone(painted):
     assert all(look.texture is not None and look.colour == (1, 1, 1) for look in mesh.looks)
 
 
-def test_images_elsewhere_damaged_or_missing_are_told_of_and_not_read(painted):
+def test_outside_damaged_or_missing_images_are_reported_and_not_read(painted):
     folder = painted.parent
     (folder.parent / "secret.png").write_bytes(RED)
     (folder / "note.png").write_text("no image")
@@ -193,10 +195,10 @@ def test_images_elsewhere_damaged_or_missing_are_told_of_and_not_read(painted):
     assert not any("images" in n for n in inspect_garment(painted).notes)
     (folder / "red cloth.png").write_bytes(b"GIF89a")
     notes = " ".join(inspect_garment(painted).notes)
-    assert "images that won't be put on it: red cloth.png" in notes and "blue" not in notes
+    assert "images that can't be used: red cloth.png" in notes and "blue" not in notes
 
 
-def test_equal_images_are_equal_and_tell_garments_apart(painted):
+def test_equal_images_compare_equal_and_different_ones_do_not(painted):
     a, b = worn(painted).polygons, worn(painted).polygons
     assert a == b and hash(a) == hash(b) and a is not None
     one, two = a.materials
@@ -204,7 +206,7 @@ def test_equal_images_are_equal_and_tell_garments_apart(painted):
     assert dataclasses.replace(a, materials=(other, two)) != a
 
 
-def test_a_picture_shows_them(painted):
+def test_rendered_frame_shows_the_images(painted):
     pytest.importorskip("pyvista")
     from physxnet_jax.viewer import render_frame
 
@@ -230,7 +232,7 @@ def test_a_picture_shows_them(painted):
     assert not ((r > 2 * g) & (r > 2 * b)).any()
 
 
-def test_gltf_images_are_found_however_they_are_kept(painted, tmp_path):
+def test_gltf_images_are_read_from_every_storage(painted, tmp_path):
     pygltflib = pytest.importorskip("pygltflib")
     write_clip(tmp_path / "a.glb", [worn(painted)], 30.0)
 
@@ -284,7 +286,7 @@ MOVES = {
 
 
 @pytest.mark.parametrize("name", MOVES)
-def test_gltf_coordinates_that_a_material_moves(painted, tmp_path, name):
+def test_gltf_texture_transforms_are_applied(painted, tmp_path, name):
     pygltflib = pytest.importorskip("pygltflib")
     write_clip(tmp_path / "a.glb", [worn(painted)], 30.0)
     told, where = MOVES[name]
@@ -301,7 +303,7 @@ def test_gltf_coordinates_that_a_material_moves(painted, tmp_path, name):
         np.testing.assert_allclose(seen, [a, 1 - b], atol=1e-5)
 
 
-def test_gltf_coordinates_of_a_second_set(painted, tmp_path):
+def test_gltf_second_texture_coordinate_set_is_read(painted, tmp_path):
     pygltflib = pytest.importorskip("pygltflib")
     write_clip(tmp_path / "a.glb", [worn(painted)], 30.0)
     document = pygltflib.GLTF2().load_binary(str(tmp_path / "a.glb"))
@@ -312,7 +314,7 @@ def test_gltf_coordinates_of_a_second_set(painted, tmp_path):
     assert images(read_mesh(tmp_path / "b.glb")) == [RED, BLUE]
 
 
-def test_obj_coordinates_that_a_material_moves(painted, tmp_path):
+def test_obj_texture_transforms_are_applied(painted, tmp_path):
     before = read_obj(painted)
     library = painted.with_name("looks.mtl")
     text = library.read_text()
@@ -332,15 +334,15 @@ def test_obj_coordinates_that_a_material_moves(painted, tmp_path):
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, 1e7, 10**400, "x", None, [1.0]])
-def test_moves_of_numbers_that_are_none_are_no_moves(number):
-    assert make_move((2.0, 1.0)) is not None
-    assert make_move((number, 1.0)) is None
-    assert make_move((1.0, number), turned=1.0) is None
-    assert make_move(offset=(0.0, number)) is None
-    assert make_move(turned=number) is None
+def test_non_finite_texture_transforms_are_ignored(number):
+    assert make_uv_transform((2.0, 1.0)) is not None
+    assert make_uv_transform((number, 1.0)) is None
+    assert make_uv_transform((1.0, number), turned=1.0) is None
+    assert make_uv_transform(offset=(0.0, number)) is None
+    assert make_uv_transform(turned=number) is None
 
 
-def test_usd_coordinates_that_a_material_moves(painted, tmp_path):
+def test_usd_texture_transforms_are_applied(painted, tmp_path):
     pytest.importorskip("pxr")
     from pxr import Gf, Sdf, Usd, UsdShade
 
@@ -377,7 +379,7 @@ def test_usd_coordinates_that_a_material_moves(painted, tmp_path):
         np.testing.assert_allclose(seen, wanted, atol=1e-5)
 
 
-def test_usd_files_of_other_programs(painted, tmp_path):
+def test_usd_textures_of_other_exporters_are_read(painted, tmp_path):
     """Texture coordinates of another name, an image in a folder, and one for each tile."""
     pytest.importorskip("pxr")
     write_clip(tmp_path / "a.usda", [worn(painted)], 30.0)

@@ -45,7 +45,7 @@ def section(blob, name):
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="counts kilobytes, as Linux does")
-def test_lengths_that_a_file_makes_up_are_not_believed(binary):
+def test_forged_usd_section_sizes_are_refused_without_allocation(binary):
     assert len(read_mesh(binary).vertices) == 3
     blob = bytearray(binary.read_bytes())
     # Tokens, and their size: 8 GB of them in a file of a kilobyte.
@@ -58,7 +58,7 @@ def test_lengths_that_a_file_makes_up_are_not_believed(binary):
     assert time.monotonic() - began < 30.0
 
 
-def test_what_takes_too_much_or_too_long_is_refused(binary, monkeypatch):
+def test_usd_files_over_the_memory_or_time_limit_are_refused(binary, monkeypatch):
     with monkeypatch.context() as m:
         m.setattr(_usd_trial, "_BASE", 1_000_000)
         with pytest.raises(FormatError, match="damaged"):
@@ -70,7 +70,7 @@ def test_what_takes_too_much_or_too_long_is_refused(binary, monkeypatch):
     np.testing.assert_array_equal(read_mesh(binary).faces, [[0, 1, 2]])
 
 
-def test_where_no_python_can_be_started_it_is_read_at_once(binary, monkeypatch):
+def test_usd_is_read_directly_where_no_subprocess_can_start(binary, monkeypatch):
     def forbidden(*words, **more):
         raise PermissionError
 
@@ -82,7 +82,7 @@ def test_where_no_python_can_be_started_it_is_read_at_once(binary, monkeypatch):
         assert len(read_mesh(binary).vertices) == 3
 
 
-def test_text_is_read_at_once_but_not_what_it_refers_to(binary, monkeypatch):
+def test_usd_text_is_read_directly_but_its_references_are_tried_first(binary, monkeypatch):
     started = []
     real = _usd_trial.subprocess.run
 
@@ -109,7 +109,7 @@ def test_text_is_read_at_once_but_not_what_it_refers_to(binary, monkeypatch):
     ],
     ids=["plain", "nested", "deep", "references", "inherits", "layers"],
 )
-def test_text_is_tried_where_it_refers_or_is_deep(tmp_path, monkeypatch, text, wanted):
+def test_usd_text_with_references_or_deep_nesting_is_tried(tmp_path, monkeypatch, text, wanted):
     tried = []
     (tmp_path / "a.usda").write_text(text)
 
@@ -122,7 +122,7 @@ def test_text_is_tried_where_it_refers_or_is_deep(tmp_path, monkeypatch, text, w
     assert bool(tried) == wanted
 
 
-def test_depth_is_that_of_brackets_wherever_a_text_is_cut(monkeypatch):
+def test_bracket_depth_does_not_depend_on_the_chunk_size(monkeypatch):
     text = b'def "a" { b = [(1, 2), (3, 4)] }' * 5
     assert _usd_trial._depth(b"") == 0
     for piece in (1, 3, 1000):

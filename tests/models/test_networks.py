@@ -11,36 +11,33 @@ import pytest
 from flax import nnx
 from scipy.spatial.transform import Rotation
 
-from physxnet_jax.garment import template
+from physxnet_jax.data import pose_windows
+from physxnet_jax.garment import skin_garment, template
 from physxnet_jax.models import (
     PAPER,
     Discriminator,
+    FeatureConfig,
     Generator,
-    Inputs,
     ModelConfig,
     Normalisation,
     Predictor,
     apply_offsets,
-    ask_mirrored,
     at_precision,
     average_networks,
+    bind_garment,
     clip_features,
     dress_frames,
     fold_batch_norm,
     make_generator,
-    make_surface,
-    make_wearable,
+    make_texel_points,
     normalise,
     pad_clip,
-    pose_windows,
-    skin_wearable,
-    start_stream,
-    stream_frame,
     upsample,
     upsampling_kernel,
+    with_mirror_tta,
 )
 from physxnet_jax.motion import clip_transforms, load_motion
-from physxnet_jax.uv import bind, dress_body, garment_map, garment_map_rows, make_atlas
+from physxnet_jax.uv import bind, cloth_offsets, dress_body, garment_map_rows, make_atlas
 
 NHWC = ("NHWC", "HWIO", "NHWC")
 
@@ -85,7 +82,7 @@ def test_upsampling_equals_a_transposed_convolution_with_its_gradients():
 
 
 @pytest.mark.parametrize("size", [(32, 32), (16, 48)])
-def test_generator_gives_the_decoders_asked_for_and_computes_no_other(size):
+def test_generator_computes_only_the_requested_decoders(size):
     g = Generator(21, ("top", "bottom", "dress"), width=4, rngs=nnx.Rngs(0))
     g.eval()
     x = jnp.ones((2, *size, 21))
@@ -103,13 +100,13 @@ def test_generator_gives_the_decoders_asked_for_and_computes_no_other(size):
     assert flops(("dress",)) < 0.6 * flops(("top", "bottom", "dress"))
 
 
-def test_sizes_that_halvings_do_not_divide_are_refused():
+def test_map_sizes_not_divisible_by_16_are_refused():
     g = Generator(18, ("top",), width=2, rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match="multiples of 16"):
         g(jnp.zeros((1, 40, 32, 18)), ("top",))
 
 
-def test_discriminator_judges_patches():
+def test_discriminator_output_is_a_patch_map():
     d = Discriminator(27, width=4, rngs=nnx.Rngs(0))
     out = d(jnp.zeros((2, 64, 64, 18)), jnp.zeros((2, 64, 64, 9)))
     assert out.shape == (2, 8, 8, 1)
@@ -123,17 +120,17 @@ def worn(body, rest):
     garments = [template(t) for t in ("top", "dress")]
     rows = [garment_map_rows(atlas, body, rest, g) for g in garments]
     valid = {g.template: r.valid for g, r in zip(garments, rows)}
-    surface = make_surface(atlas, body, rest, valid)
-    wearables = [
-        make_wearable(body, rest, g, bind(atlas, body, rest, g, r.valid))
+    surface = make_texel_points(atlas, body, rest, valid)
+    bound_garments = [
+        bind_garment(body, rest, g, bind(g, atlas=atlas, body=body, rest=rest, valid=r.valid))
         for g, r in zip(garments, rows)
     ]
-    return atlas, surface, wearables
+    return atlas, surface, bound_garments
 
 
-LOCAL = Inputs()
-PAPER_FAR = Inputs("paper", frames=3, stride=3)
-PAPER_ONE = Inputs("paper", frames=1)
+LOCAL = FeatureConfig()
+PAPER_FAR = FeatureConfig("paper", frames=3, stride=3)
+PAPER_ONE = FeatureConfig("paper", frames=1)
 
 
 def transforms(body, rest, turn=None):
@@ -149,7 +146,7 @@ def transforms(body, rest, turn=None):
     return jnp.asarray(world), jnp.asarray(shift)
 
 
-def test_local_features_do_not_see_a_turn_about_the_vertical_but_paper_ones_do(worn, body, rest):
+def test_only_local_features_are_invariant_to_heading(worn, body, rest):
     _, surface, _ = worn
     turn = Rotation.from_euler("Y", 1.1)
     out = {}
@@ -176,9 +173,9 @@ def test_local_features_do_not_see_a_turn_about_the_vertical_but_paper_ones_do(w
     "inputs",
     [
         PAPER,
-        Inputs(),
-        Inputs(frames=2, stride=3, acceleration=False),
-        Inputs(frames=1, place=False),
+        FeatureConfig(),
+        FeatureConfig(frames=2, stride=3, acceleration=False),
+        FeatureConfig(frames=1, position=False),
     ],
     ids=["paper", "local", "far", "one"],
 )
@@ -194,7 +191,7 @@ def test_features_of_a_window_equal_features_of_the_clip(worn, body, rest, input
         inputs,
     )
     assert clip.shape == (8, surface.rest.shape[0], inputs.channels)
-    windows = [pose_windows(x, inputs) for x in (world, shift)]
+    windows = [pose_windows(x, inputs.window) for x in (world, shift)]
     assert windows[0].shape[1] == inputs.window
     each = jnp.stack(
         [
@@ -205,11 +202,11 @@ def test_features_of_a_window_equal_features_of_the_clip(worn, body, rest, input
     np.testing.assert_allclose(np.asarray(clip), np.asarray(each), atol=2e-2)
 
 
-def test_a_stride_looks_back_by_whole_frames(worn, body, rest):
+def test_stride_selects_whole_frames_of_the_history(worn, body, rest):
     """The oldest velocity of every third frame is that of six frames before."""
     _, surface, _ = worn
     world, shift = transforms(body, rest)
-    far, near = Inputs(frames=3, stride=3), Inputs(frames=1)
+    far, near = FeatureConfig(frames=3, stride=3), FeatureConfig(frames=1)
     at = (surface.rest, surface.weights)
     old = clip_features(*at, pad_clip(world, far), pad_clip(shift, far), 30.0, PAPER_FAR)
     new = clip_features(*at, pad_clip(world, near), pad_clip(shift, near), 30.0, PAPER_ONE)
@@ -217,7 +214,7 @@ def test_a_stride_looks_back_by_whole_frames(worn, body, rest):
     assert np.abs(np.asarray(old)[6:, :, :3] - np.asarray(new)[6:, :, :3]).max() > 0.1
 
 
-def test_place_tells_the_pose_when_nothing_moves(worn, body, rest):
+def test_position_channel_encodes_the_pose_at_rest(worn, body, rest):
     """A raised arm that is held still: velocities are silent, its place is not."""
     _, surface, _ = worn
     world, shift = transforms(body, rest)
@@ -230,10 +227,10 @@ def test_place_tells_the_pose_when_nothing_moves(worn, body, rest):
     assert np.abs(a[:, :18]).max() == 0 and np.abs(b[:, :18]).max() == 0
     assert np.abs(a[:, 21:] - b[:, 21:]).max() > 0.01
     with pytest.raises(ValueError, match="at least 1"):
-        Inputs(frames=0)
+        FeatureConfig(frames=0)
 
 
-def test_speed_is_in_metres_a_second_at_any_frame_rate(worn, body, rest):
+def test_velocity_is_in_metres_per_second_at_any_frame_rate(worn, body, rest):
     _, surface, _ = worn
     fast = load_motion("walk", fps=60.0)
     slow = load_motion("walk", fps=30.0)
@@ -254,7 +251,7 @@ def test_speed_is_in_metres_a_second_at_any_frame_rate(worn, body, rest):
 
 def predictor(worn, family, zero=False):
     atlas, surface, _ = worn
-    config = ModelConfig(Inputs(family), resolution=32, width=4, templates=("top", "dress"))
+    config = ModelConfig(FeatureConfig(family), resolution=32, width=4, templates=("top", "dress"))
     network = make_generator(config)
     network.eval()
     graph, state = nnx.split(network)
@@ -271,32 +268,39 @@ def predictor(worn, family, zero=False):
     )
 
 
-def test_zero_output_of_the_local_family_is_exactly_skinning(worn, body, rest):
-    _, _, wearables = worn
+def test_zero_output_of_the_local_family_equals_skinning(worn, body, rest):
+    _, _, bound_garments = worn
     r, s = transforms(body, rest)
     out = dress_frames(
-        predictor(worn, "local", zero=True), wearables, pad_clip(r, LOCAL), pad_clip(s, LOCAL), 30.0
+        predictor(worn, "local", zero=True),
+        bound_garments,
+        pad_clip(r, LOCAL),
+        pad_clip(s, LOCAL),
+        30.0,
     )
-    for w, x in zip(wearables, out):
-        skinned = jax.vmap(lambda a, b, w=w: skin_wearable(w, a, b))(r, s)
+    for w, x in zip(bound_garments, out):
+        skinned = jax.vmap(lambda a, b, w=w: skin_garment(w, a, b))(r, s)
         np.testing.assert_array_equal(np.asarray(x), np.asarray(skinned))
 
 
-def test_turning_the_person_turns_the_answer(worn, body, rest):
-    _, _, wearables = worn
+def test_local_family_is_equivariant_to_heading(worn, body, rest):
+    _, _, bound_garments = worn
     turn = Rotation.from_euler("Y", 0.8)
     p = predictor(worn, "local")
     runs = [
-        dress_frames(p, wearables, *(pad_clip(x, LOCAL) for x in transforms(body, rest, t)), 30.0)
+        dress_frames(
+            p, bound_garments, *(pad_clip(x, LOCAL) for x in transforms(body, rest, t)), 30.0
+        )
         for t in (None, turn)
     ]
     for a, b in zip(*runs):
         np.testing.assert_allclose(np.asarray(a) @ turn.as_matrix().T, np.asarray(b), atol=2e-4)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("family", ["local", "paper"])
-def test_dressing_is_differentiable_in_the_pose(worn, body, rest, family):
-    _, _, wearables = worn
+def test_pose_gradients_match_finite_differences(worn, body, rest, family):
+    _, _, bound_garments = worn
     p = predictor(worn, family)
     motion = load_motion("walk", fps=30.0)
     poses, root = motion.rotations[20:25], motion.root[20:25]
@@ -311,7 +315,7 @@ def test_dressing_is_differentiable_in_the_pose(worn, body, rest, family):
         last = poses[-1].at[bend].set(quaternion_multiply(turn, poses[-1, bend]))
         q = jnp.concatenate([poses[:-1], last[None]])
         world, shift = jax.vmap(lambda a, b: body.transforms(rest, a, b))(q, root)
-        return sum(x[..., 1].mean() for x in dress_frames(p, wearables, world, shift, 30.0))
+        return sum(x[..., 1].mean() for x in dress_frames(p, bound_garments, world, shift, 30.0))
 
     slope = jax.grad(height)(jnp.float32(0.1))
     step = 2e-2
@@ -338,8 +342,8 @@ def trained_like(surface, atlas, inputs, seed=0):
     return Predictor(atlas, surface, scales, state, graph, config)
 
 
-def test_features_beyond_any_motion_are_shortened_and_no_others(worn):
-    inputs = Inputs(frames=1, gravity=False)
+def test_only_features_beyond_the_limit_are_clipped(worn):
+    inputs = FeatureConfig(frames=1, gravity=False)
     two = jnp.full((), 2.0)
     scales = Normalisation(two, two, {"top": two})
     unit = np.array([[0.6, 0.0, 0.8]], np.float32)
@@ -355,7 +359,7 @@ def test_features_beyond_any_motion_are_shortened_and_no_others(worn):
     assert np.isnan(np.asarray(normalise(x.at[0, 1].set(jnp.nan), scales, inputs))).any()
 
 
-def test_folded_networks_answer_as_before(worn):
+def test_folded_batch_norm_keeps_the_predictions(worn):
     atlas, surface, _ = worn
     predictor = trained_like(surface, atlas, LOCAL)
     folded = fold_batch_norm(predictor)
@@ -372,7 +376,7 @@ def test_folded_networks_answer_as_before(worn):
         np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
 
 
-def test_networks_averaged_answer_the_mean_of_their_answers(worn):
+def test_averaged_networks_predict_the_mean_of_their_offsets(worn):
     """Offsets in metres are averaged, whatever each network scales them by."""
     atlas, surface, _ = worn
     one, two = (trained_like(surface, atlas, LOCAL, seed=k) for k in (0, 1))
@@ -398,15 +402,15 @@ def test_networks_averaged_answer_the_mean_of_their_answers(worn):
     other = dataclasses.replace(
         two, normalisation=dataclasses.replace(two.normalisation, velocity=jnp.float32(2.0))
     )
-    ways = [dataclasses.replace(two, **way) for way in ({"mirrored": True}, {"relaxation": 8})]
-    for wrong in ([], [one, other], [one, ways[0]], [one, ways[1]], [ways[1], one]):
+    augmented = dataclasses.replace(two, mirror_tta=True)
+    for wrong in ([], [one, other], [one, augmented], [augmented, one]):
         with pytest.raises(ValueError, match=r"no predictors|different"):
             average_networks(wrong)
     with pytest.raises(ValueError, match="before their batch norm is folded"):
         average_networks([one, fold_batch_norm(two)])
 
 
-def test_fewer_bits_change_little_and_more_bits_next_to_nothing(worn):
+def test_bfloat16_and_float64_predictions_are_close_to_float32(worn):
     """bfloat16 has 8 bits: half a per cent a number, averaged over the taps of a kernel."""
     atlas, surface, _ = worn
     predictor = trained_like(surface, atlas, LOCAL)
@@ -425,10 +429,10 @@ def test_fewer_bits_change_little_and_more_bits_next_to_nothing(worn):
 
 
 @pytest.mark.parametrize("inputs", [LOCAL, PAPER_FAR], ids=["local", "far"])
-def test_asked_for_the_mirrored_person_too_the_answer_is_mirrored(worn, inputs):
+def test_test_time_augmentation_makes_predictions_mirror_symmetric(worn, inputs):
     atlas, surface, _ = worn
     plain = trained_like(surface, atlas, inputs)
-    both = ask_mirrored(plain)
+    both = with_mirror_tta(plain)
 
     def mirror(texels):
         signs = np.where(np.arange(texels.shape[-1]) % 3, 1.0, -1.0).astype(np.float32)
@@ -452,36 +456,19 @@ def test_asked_for_the_mirrored_person_too_the_answer_is_mirrored(worn, inputs):
         assert float(jnp.abs(two - plain.from_features(mirror(x), (t,))[t]).max()) > 0.01
     moved = dataclasses.replace(surface, rest=surface.rest + jnp.array([[0.05, 0.0, 0.0]]))
     with pytest.raises(ValueError, match="mirror images"):
-        ask_mirrored(dataclasses.replace(plain, surface=moved))
+        with_mirror_tta(dataclasses.replace(plain, texel_points=moved))
 
 
-@pytest.mark.parametrize("inputs", [LOCAL, PAPER_FAR], ids=["local", "far"])
-def test_a_stream_is_the_clip_frame_by_frame(worn, body, rest, inputs):
-    atlas, surface, wearables = worn
-    predictor = trained_like(surface, atlas, inputs)
-    world, shift = transforms(body, rest)
-    clip = dress_frames(
-        predictor, wearables, pad_clip(world, inputs), pad_clip(shift, inputs), 30.0
-    )
-    step = jax.jit(stream_frame, static_argnames="fps", donate_argnames="stream")
-    stream = start_stream(predictor, world[0], shift[0])
-    for k in range(world.shape[0]):
-        stream, garments = step(predictor, wearables, stream, world[k], shift[k], fps=30.0)
-        for live, whole in zip(garments, clip, strict=True):
-            np.testing.assert_allclose(np.asarray(live), np.asarray(whole[k]), atol=2e-5)
-    assert np.abs(np.asarray(clip[0][-1] - clip[0][0])).max() > 0.01, "nothing moves"
-
-
-def test_a_dress_by_the_paper_begins_and_ends_on_joined_legs(body, rest):
+def test_paper_family_dress_offsets_round_trip_on_the_dress_body(body, rest):
     """Its map at rest, from the hull of both legs, gives the dress back."""
     atlas, g = make_atlas(64), template("dress")
     rows = garment_map_rows(atlas, body, rest, g)
-    surface = make_surface(atlas, body, rest, {"dress": rows.valid})
-    worn = make_wearable(body, rest, g, bind(atlas, body, rest, g, rows.valid))
+    surface = make_texel_points(atlas, body, rest, {"dress": rows.valid})
+    worn = bind_garment(body, rest, g, bind(g, atlas=atlas, body=body, rest=rest, valid=rows.valid))
     joined = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
     np.testing.assert_allclose(surface.rest_dress, atlas.to_body @ joined, atol=1e-6)
     np.testing.assert_allclose(worn.anchor, worn.binding.to_body @ joined, atol=1e-6)
-    offsets = garment_map(rows, g.mesh.vertices, surface.rest_dress)
+    offsets = cloth_offsets(rows, g.mesh.vertices, surface.rest_dress)
     turns, shifts = (
         jnp.tile(jnp.eye(3), (len(body.parents), 1, 1)),
         jnp.zeros((len(body.parents), 3)),
@@ -499,7 +486,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from physxnet_jax.body import load_body
-from physxnet_jax.io import load_predictor
+from physxnet_jax.models import load_predictor
 from physxnet_jax.models import clip_features, normalise
 from physxnet_jax.motion import load_motion
 
@@ -516,7 +503,7 @@ turn, shift = (
 @jax.grad
 def slope(turn):
     seen = clip_features(
-        network.surface.rest, network.surface.weights, turn, shift, 30.0, inputs
+        network.texel_points.rest, network.texel_points.weights, turn, shift, 30.0, inputs
     )
     return jnp.sum(normalise(seen, network.normalisation, inputs) ** 2)
 
@@ -525,7 +512,8 @@ print("finite" if bool(jnp.isfinite(found).all()) else "spoiled", float(jnp.abs(
 """
 
 
-def test_slopes_are_finite_however_a_compiler_rounds():
+@pytest.mark.release
+def test_gradients_are_finite_in_unoptimised_programs():
     """Unoptimised programs compute values anew, and the maximum among them is none of them."""
     done = subprocess.run(
         [sys.executable, "-c", UNOPTIMISED], capture_output=True, text=True, timeout=300

@@ -26,7 +26,8 @@ _SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
 BVH, ASF, AMC = (_SAMPLES[name] for name in ("BVH", "ASF", "AMC"))
 
 
-def test_all_fifty_clips_load_and_have_the_protocols_frames(data_dir):
+@pytest.mark.release
+def test_all_fifty_actions_load_with_the_frames_of_the_protocol(data_dir):
     actions = read_protocol(data_dir / "mocap")
     assert len(actions) == 50
     counts = {s: [a for a in actions if a.split == s] for s in ("train", "test", "extra")}
@@ -42,7 +43,7 @@ def test_all_fifty_clips_load_and_have_the_protocols_frames(data_dir):
 @pytest.mark.parametrize(
     "name", ["amc/002_04.amc", "mb/005_03.bvh", "daz/135_04.bvh", "max/jumping_jacks.bvh"]
 )
-def test_retargeted_limbs_point_where_the_sources_do(data_dir, body, rest, name):
+def test_retargeted_limbs_match_the_source_directions(data_dir, body, rest, name):
     path = data_dir / "mocap" / name
     source = read_bvh(path) if path.suffix == ".bvh" else read_amc(path)
     motion = retarget(source)
@@ -65,7 +66,7 @@ def test_retargeted_limbs_point_where_the_sources_do(data_dir, body, rest, name)
         assert np.degrees(np.arccos(np.clip(cosine, -1, 1))).max() < 2.0
 
 
-def test_one_trial_as_amc_and_bvh_gives_one_pose(data_dir):
+def test_amc_and_bvh_of_one_trial_give_the_same_pose(data_dir):
     a = load_motion(data_dir / "mocap/amc/005_11.amc")
     b = load_motion(data_dir / "mocap/mb/005_11.bvh")
     # The BVH dropped its T-pose frame; both then start with the same frame.
@@ -86,7 +87,7 @@ def test_feet_stay_near_the_floor_on_standing_clips(data_dir, body, rest, name):
     assert height.min() == pytest.approx(0.0, abs=2e-3) and height.max() < 0.06
 
 
-def test_true_rates_come_from_the_table_where_headers_lie(data_dir):
+def test_source_rate_overrides_a_wrong_header(data_dir):
     with (data_dir / "mocap/CLIPS.csv").open() as file:
         rates = {r["file"]: float(r["fps"]) for r in csv.DictReader(file)}
     assert rates["daz/060_12.bvh"] == 60.0
@@ -94,7 +95,7 @@ def test_true_rates_come_from_the_table_where_headers_lie(data_dir):
     assert load_motion(data_dir / "mocap/daz/060_12.bvh", source_fps=60.0).fps == 60.0
 
 
-def test_a_small_bvh_is_read_exactly(tmp_path):
+def test_small_bvh_is_read_exactly(tmp_path):
     path = tmp_path / "a.bvh"
     path.write_text(BVH)
     clip = read_bvh(path)
@@ -105,7 +106,7 @@ def test_a_small_bvh_is_read_exactly(tmp_path):
     np.testing.assert_allclose(clip.positions()[1, 1], [0, 1, -1], atol=1e-12)
 
 
-def test_of_several_skeletons_the_largest_is_read(tmp_path):
+def test_largest_of_several_skeletons_is_read(tmp_path):
     """A prop before the person, a camera after: neither moves him."""
     head, frames = BVH.split("MOTION")
     prop = head.split("JOINT")[0].partition("\n")[2].replace("Hips", "Prop") + "}\n"
@@ -124,7 +125,7 @@ def test_of_several_skeletons_the_largest_is_read(tmp_path):
         np.testing.assert_array_equal(a, b)
 
 
-def test_a_name_that_comes_again_gets_a_number(tmp_path):
+def test_duplicate_joint_names_are_numbered(tmp_path):
     knee = BVH[BVH.index("  JOINT Knee") : BVH.index("}\nMOTION")]
     text = BVH.replace(knee, knee.replace("Knee", "Knee_2") + 2 * knee)
     path = tmp_path / "a.bvh"
@@ -145,8 +146,8 @@ def test_a_name_that_comes_again_gets_a_number(tmp_path):
         (lambda s: s.replace("0 1 0 0 0 90 10 0 0", "0 1 0 0 0 90 10 0"), 20, "values"),
         (lambda s: s.replace("90 10", "nan 10"), 20, "not finite"),
         (lambda s: s.replace("90 10", "x 10"), 20, "not a number"),
-        (lambda s: s.replace("CHANNELS 3", "CHANNELS 4"), 9, "CHANNELS says"),
-        (lambda s: s.replace("CHANNELS 3", "CHANNELS \u00b2"), 9, "CHANNELS says"),
+        (lambda s: s.replace("CHANNELS 3", "CHANNELS 4"), 9, "CHANNELS declares"),
+        (lambda s: s.replace("CHANNELS 3", "CHANNELS \u00b2"), 9, "CHANNELS declares"),
         (lambda s: s.replace("Frames: 2", "Frames: " + 5000 * "9"), 17, "number of frames"),
         (
             lambda s: s.replace(
@@ -163,7 +164,7 @@ def test_a_name_that_comes_again_gets_a_number(tmp_path):
         (lambda s: s.replace("ROOT Hips", "JOINT Hips"), 2, "outside any joint"),
     ],
 )
-def test_broken_bvh_files_are_refused_naming_file_line_and_fix(tmp_path, change, line, says):
+def test_broken_bvh_errors_name_the_file_line_and_fix(tmp_path, change, line, says):
     path = tmp_path / "broken.bvh"
     path.write_text(change(BVH), encoding="utf-8")
     with pytest.raises(MotionError, match=says) as error:
@@ -197,7 +198,7 @@ def test_broken_amc_files_are_refused(tmp_path, change, says):
     assert str(path) in str(error.value)
 
 
-def test_an_amc_without_a_skeleton_says_where_it_looked(tmp_path):
+def test_missing_asf_error_names_the_expected_file(tmp_path):
     path = tmp_path / "01_02.amc"
     path.write_text(AMC)
     with pytest.raises(MotionError, match=r"01\.asf"):
@@ -206,7 +207,7 @@ def test_an_amc_without_a_skeleton_says_where_it_looked(tmp_path):
     assert read_amc(path).names == ("root", "lfemur")
 
 
-def test_unknown_joints_and_formats_are_named(tmp_path):
+def test_unknown_joints_and_files_are_reported(tmp_path):
     path = tmp_path / "a.bvh"
     path.write_text(BVH)
     with pytest.raises(MotionError, match="unknown joints"):
@@ -226,7 +227,7 @@ def test_resampling_keeps_duration(data_dir):
     assert abs((slow.num_frames - 1) / 24 - (motion.num_frames - 1) / motion.fps) < 1 / 24
 
 
-def test_blank_lines_and_tabs_of_other_exporters_are_read(tmp_path):
+def test_bvh_blank_lines_and_tabs_are_accepted(tmp_path):
     plain, odd = tmp_path / "a.bvh", tmp_path / "b.bvh"
     plain.write_text(BVH)
     odd.write_text("\n \n" + BVH.replace("Frame Time:", "Frame\tTime: ").replace("\n", "\r\n"))
@@ -236,12 +237,12 @@ def test_blank_lines_and_tabs_of_other_exporters_are_read(tmp_path):
         read_bvh(odd)
 
 
-def test_a_true_rate_is_of_files_alone():
+def test_source_rate_is_refused_for_built_in_clips():
     with pytest.raises(MotionError, match="'walk' is computed at any rate"):
         load_motion("walk", fps=30.0, source_fps=60.0)
 
 
-def test_a_skeleton_in_radians_is_the_one_in_degrees(tmp_path):
+def test_asf_in_radians_matches_asf_in_degrees(tmp_path):
     (tmp_path / "01.asf").write_text(ASF)
     (tmp_path / "01_02.amc").write_text(AMC)
     wanted = read_amc(tmp_path / "01_02.amc")

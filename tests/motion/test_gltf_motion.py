@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
 from physxnet_jax.errors import MotionError
+from physxnet_jax.io._gltf_file import GltfFile
 from physxnet_jax.motion import (
     JOINT_MAPS,
     LIMBS,
@@ -20,7 +21,6 @@ from physxnet_jax.motion import (
     procedural_clip,
     read_gltf,
 )
-from physxnet_jax.motion._gltf_file import GltfFile
 
 TESTS = pathlib.Path(__file__).parents[1]
 _SAMPLES = runpy.run_path(str(TESTS / "samples.py"))
@@ -117,7 +117,7 @@ def write_gltf(path, body, rest, motion, mode="LINEAR", scale=0.01):
 
 @pytest.mark.parametrize("mode", ["LINEAR", "CUBICSPLINE", "STEP"])
 @pytest.mark.parametrize("suffix", [".glb", ".gltf"])
-def test_a_walk_through_gltf_is_the_same_walk(body, rest, tmp_path, mode, suffix):
+def test_gltf_motion_round_trips(body, rest, tmp_path, mode, suffix):
     walk = procedural_clip("walk", fps=30.0)
     again = load_motion(write_gltf(tmp_path / f"walk{suffix}", body, rest, walk, mode))
     assert again.num_frames == walk.num_frames and again.fps == 30.0
@@ -149,7 +149,7 @@ def as_vrm(path, key, out):
 @pytest.mark.parametrize(
     "key, name", [("VRM", "a.vrm"), ("VRMC_vrm", "a.vrm"), ("VRMC_vrm_animation", "a.vrma")]
 )
-def test_vrm_says_which_node_is_which_bone(body, rest, tmp_path, key, name):
+def test_vrm_humanoid_bones_define_the_joints(body, rest, tmp_path, key, name):
     walk = procedural_clip("walk", fps=15.0)
     plain = write_gltf(tmp_path / "walk.glb", body, rest, walk)
     path = as_vrm(plain, key, tmp_path / name)
@@ -165,7 +165,7 @@ def test_vrm_says_which_node_is_which_bone(body, rest, tmp_path, key, name):
 
 
 @pytest.mark.parametrize("told", [3, {"hips": 3}, [{"bone": "hips"}], {"hips": {"node": 999}}])
-def test_damaged_words_of_vrm_are_refused(body, rest, tmp_path, told):
+def test_damaged_vrm_humanoid_data_is_refused(body, rest, tmp_path, told):
     path = write_gltf(tmp_path / "walk.glb", body, rest, procedural_clip("walk", fps=5.0))
     document = pygltflib.GLTF2().load(str(path))
     document.extensions = {"VRM": {"humanoid": {"humanBones": told}}}
@@ -175,7 +175,7 @@ def test_damaged_words_of_vrm_are_refused(body, rest, tmp_path, told):
 
 
 @pytest.mark.parametrize("packed", ["EXT_meshopt_compression", "KHR_draco_mesh_compression"])
-def test_compressed_files_are_named_and_how_to_unpack_them(body, rest, tmp_path, packed):
+def test_compressed_gltf_errors_explain_how_to_unpack(body, rest, tmp_path, packed):
     path = write_gltf(tmp_path / "walk.glb", body, rest, procedural_clip("walk", fps=5.0))
     document = pygltflib.GLTF2().load(str(path))
     document.extensionsRequired = [packed]
@@ -188,7 +188,7 @@ def test_compressed_files_are_named_and_how_to_unpack_them(body, rest, tmp_path,
     assert load_motion(path).num_frames > 2
 
 
-def test_the_joints_of_the_largest_skin_are_the_skeleton(body, rest, tmp_path):
+def test_skeleton_is_taken_from_the_largest_skin(body, rest, tmp_path):
     walk = procedural_clip("walk", fps=10.0)
     path = write_gltf(tmp_path / "walk.glb", body, rest, walk)
     document = pygltflib.GLTF2().load(str(path))
@@ -197,7 +197,7 @@ def test_the_joints_of_the_largest_skin_are_the_skeleton(body, rest, tmp_path):
     assert limbs_apart(body, rest, walk, load_motion(path)) < 0.2
 
 
-def test_a_trunk_without_a_direction_is_refused(tmp_path):
+def test_skeleton_with_collinear_hips_and_shoulders_is_refused(tmp_path):
     """Found by a fuzzer: a figure that lies, one hip above the other,
     in line with the shoulders."""
     document = json.loads(runpy.run_path(str(TESTS / "test_fuzz.py"))["_gltf"](tmp_path))
@@ -214,10 +214,10 @@ def test_a_trunk_without_a_direction_is_refused(tmp_path):
         load_motion(path)
 
 
-def test_between_keys_linear_tracks_are_turned_evenly(body, rest, tmp_path):
+def test_linear_tracks_rotate_at_constant_speed_between_keys(body, rest, tmp_path):
     slow = procedural_clip("walk", fps=10.0)
     path = write_gltf(tmp_path / "walk.glb", body, rest, slow)
-    from physxnet_jax.motion._gltf_file import GltfFile
+    from physxnet_jax.io._gltf_file import GltfFile
 
     file = GltfFile(path)
     times, fps = file.frame_times()
@@ -227,7 +227,7 @@ def test_between_keys_linear_tracks_are_turned_evenly(body, rest, tmp_path):
     assert half == pytest.approx(0.5 * whole, rel=0.05)
 
 
-def test_names_of_buffers_may_be_written_as_addresses(body, rest, tmp_path):
+def test_percent_encoded_buffer_names_are_read_inside_the_folder(body, rest, tmp_path):
     path = write_gltf(tmp_path / "walk.gltf", body, rest, procedural_clip("walk", fps=10.0))
     (tmp_path / "walk.bin").rename(tmp_path / "my walk.bin")
     text = path.read_text()
@@ -311,7 +311,7 @@ def test_broken_gltf_files_are_refused(body, rest, tmp_path, name):
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(at=st.floats(0, 1), byte=st.integers(0, 255), length=st.integers(1, 40))
-def test_damaged_bytes_give_a_clip_or_a_clear_error(body, rest, tmp_path, at, byte, length):
+def test_damaged_bytes_give_a_clip_or_a_motion_error(body, rest, tmp_path, at, byte, length):
     good = tmp_path / "good.glb"
     if not good.exists():
         write_gltf(good, body, rest, procedural_clip("walk", fps=5.0))
@@ -362,7 +362,7 @@ def amass(body, rest, motion, layout="poses", z_up=True):
 
 @pytest.mark.parametrize("layout", ["poses", "pose_body"])
 @pytest.mark.parametrize("z_up", [True, False])
-def test_a_walk_in_amass_layout_is_the_same_walk(body, rest, tmp_path, layout, z_up):
+def test_amass_motion_round_trips(body, rest, tmp_path, layout, z_up):
     walk = procedural_clip("walk", fps=15.0)
     path = tmp_path / "walk_poses.npz"
     np.savez(path, **amass(body, rest, walk, layout, z_up))
@@ -427,7 +427,7 @@ def document(folder, arrays, nodes, **more):
     return GltfFile(path)
 
 
-def test_whole_numbers_that_stand_for_fractions_and_rows_with_gaps_are_read(tmp_path):
+def test_normalized_integer_and_strided_accessors_are_read(tmp_path):
     """The specification's 3.11: f = max(c / 127, -1) and the like; 3.6.2.4: strides."""
     short = np.array([[-32768, -32767, 16384, 32767]], "<i2")
     byte = np.array([[0, 51, 255, 128]], "|u1")
@@ -448,7 +448,7 @@ def test_whole_numbers_that_stand_for_fractions_and_rows_with_gaps_are_read(tmp_
     np.testing.assert_array_equal(file.accessor(3), rows[:, 2:5])
 
 
-def test_a_node_may_stand_by_a_matrix(tmp_path):
+def test_node_matrices_are_applied(tmp_path):
     turn = Rotation.from_euler("XYZ", [20, 50, -70], degrees=True).as_matrix()
     m = np.eye(4)
     m[:3, :3], m[:3, 3] = turn * [2.0, 3.0, 4.0], [5.0, 6.0, 7.0]
@@ -460,7 +460,7 @@ def test_a_node_may_stand_by_a_matrix(tmp_path):
     np.testing.assert_allclose(world[1, :3, 3], turn @ [2.0, 3.0, 4.0] + [5, 6, 7], atol=1e-12)
 
 
-def test_an_animation_begins_with_its_first_key(tmp_path):
+def test_animation_starts_at_its_first_key(tmp_path):
     """Cut out of a longer one it begins at two seconds: nothing stands still until then."""
     times = (2.0 + np.arange(4) / 10.0).astype("<f4")
     places = np.array([[k, 0, 0] for k in range(4)], "<f4")

@@ -38,7 +38,7 @@ def walk(body):
     return procedural_clip("walk", fps=30.0, body=body)
 
 
-def test_a_good_motion_is_ready(walk):
+def test_clean_motion_is_reported_ready(walk):
     found = inspect_motion("walk")
     assert found.problems == found.notes == found.left_out == ()
     assert found.verdict == "ready: physxnet dress walk --wear top bottom -o walk.usdc"
@@ -51,7 +51,7 @@ def test_a_good_motion_is_ready(walk):
 
 
 @pytest.mark.parametrize(("scale", "unit"), [(0.01, "cm"), (1.0, "m"), (0.37, None)])
-def test_the_unit_is_told_by_the_legs(body, rest, walk, tmp_path, scale, unit):
+def test_unit_is_detected_from_the_leg_length(body, rest, walk, tmp_path, scale, unit):
     path = tmp_path / "walk.bvh"
     text = bvh(body, rest, walk, JOINT_MAPS["mixamo"])
     # The helper writes centimetres.
@@ -66,10 +66,10 @@ def test_the_unit_is_told_by_the_legs(body, rest, walk, tmp_path, scale, unit):
     path.write_text("\n".join(lines))
     found = inspect_motion(path)
     assert found.unit == unit and found.skeleton in ("mixamo", "cmu-motionbuilder")
-    assert found.reference in ("its rest pose", "the T-pose in its first frame, which is left out")
+    assert found.reference in ("its rest pose", "the T-pose in its first frame, which is dropped")
 
 
-def test_what_is_wrong_is_found_where_it_is(body, rest, walk, tmp_path):
+def test_motion_faults_are_reported_with_their_frame(body, rest, walk, tmp_path):
     def seen(name, **change):
         save_motion(tmp_path / f"{name}.npz", dataclasses.replace(walk, **change))
         return inspect_motion(tmp_path / f"{name}.npz")
@@ -79,7 +79,7 @@ def test_what_is_wrong_is_found_where_it_is(body, rest, walk, tmp_path):
     far[50:] += [0.0, 0.0, 3.0]
     thrown = seen("thrown", root=jnp.asarray(far))
     assert len(thrown.problems) == 1 and "at frame 49" in thrown.problems[0]
-    assert "--source-fps" in thrown.problems[0] and "look at what is wrong" in thrown.verdict
+    assert "--source-fps" in thrown.problems[0] and "fix the problems first" in thrown.verdict
     deep = root.copy()
     deep[60, 1] -= 0.5
     sunk = dataclasses.replace(walk, root=jnp.asarray(deep))
@@ -93,7 +93,7 @@ def test_what_is_wrong_is_found_where_it_is(body, rest, walk, tmp_path):
     assert any("a single frame" in n for n in one.notes) and one.fastest == 0
 
 
-def test_a_limb_that_turns_over_is_named(walk, body, tmp_path):
+def test_limb_flips_are_reported_with_joint_and_frame(walk, body, tmp_path):
     turns = np.asarray(walk.rotations).copy()
     j = body.joint("LeftUpLeg")
     w, x, y, z = turns[70:, j].T
@@ -104,9 +104,7 @@ def test_a_limb_that_turns_over_is_named(walk, body, tmp_path):
     assert problem.startswith("LeftUpLeg turns by 1") and "from frame 69 to 70" in problem
 
 
-def test_what_turns_over_between_two_frames_as_dressed_is_told_of_in_faster_files(
-    walk, body, tmp_path
-):
+def test_limb_flips_at_the_dressing_rate_are_reported_for_faster_files(walk, body, tmp_path):
     """Two frames of 60 a second are one of 30: half of the turn in each."""
     fast = load_motion("walk", fps=60.0)
     j = body.joint("LeftArm")
@@ -120,11 +118,11 @@ def test_what_turns_over_between_two_frames_as_dressed_is_told_of_in_faster_file
     path = tmp_path / "a.npz"
     save_motion(path, dataclasses.replace(fast, rotations=jnp.asarray(turns, jnp.float32)))
     (problem,) = inspect_motion(path).problems
-    assert "LeftArm turns by" in problem and problem.endswith("(frames of 30 a second).")
+    assert "LeftArm turns by" in problem and problem.endswith("(at 30 frames per second).")
     assert sudden_turns(body, load_motion(path)) is None
 
 
-def test_axes_of_rest_and_motion_may_differ(body, rest, walk, tmp_path):
+def test_rest_and_motion_axis_mismatch_is_corrected_or_reported(body, rest, walk, tmp_path):
     """A rest pose along Z beside frames along Y is turned alone; the other way is told of."""
     y, z = walk, Rotation.from_euler("X", 90.0, degrees=True)
     path = tmp_path / "a.bvh"
@@ -148,7 +146,7 @@ def test_axes_of_rest_and_motion_may_differ(body, rest, walk, tmp_path):
         assert note == frames_turned
 
 
-def test_a_map_of_ones_own_is_in_the_command(body, rest, walk, tmp_path):
+def test_custom_joint_map_is_part_of_the_suggested_command(body, rest, walk, tmp_path):
     names = {b: f"own {k}" for k, b in enumerate(JOINT_MAPS["mixamo"])}
     path, table = tmp_path / "my walk.bvh", tmp_path / "names.toml"
     path.write_text(bvh(body, rest, walk, {b: n.replace(" ", "") for b, n in names.items()}))
@@ -156,20 +154,20 @@ def test_a_map_of_ones_own_is_in_the_command(body, rest, walk, tmp_path):
         inspect_motion(path)
     table.write_text("\n".join(f'{b} = "{n.replace(" ", "")}"' for b, n in names.items()))
     found = inspect_motion(path, joint_map=table, source_fps=60)
-    assert found.skeleton == "own map" and found.fps == 60
+    assert found.skeleton == "custom map" and found.fps == 60
     assert found.carried == len(names) and found.joints == len(names)
     assert f"--joint-map {table} --source-fps 60" in found.command and "'my walk.usdc'" in (
         found.command
     )
-    assert any("60 frames a second become 30" in n for n in found.notes)
+    assert any("60 frames per second are resampled to 30" in n for n in found.notes)
 
 
-def test_real_clips(data_dir):
+def test_real_clip_reports_are_correct(data_dir):
     mocap = data_dir / "mocap"
     found = inspect_motion(mocap / "mb" / "005_06.bvh")
     assert "RightUpLeg turns by" in found.problems[0] and found.skeleton == "cmu-motionbuilder"
     asf = inspect_motion(mocap / "amc" / "001_01.amc")
-    assert asf.unit == "5.6 cm, CMU's" and asf.skeleton == "cmu-asf" and not asf.problems
+    assert asf.unit == "5.6 cm (CMU)" and asf.skeleton == "cmu-asf" and not asf.problems
     slow = next((mocap / "daz").glob("060_*.bvh"))
     said = inspect_motion(slow)
     assert any("--source-fps 60" in n for n in said.notes) and said.unit == "cm"
@@ -179,7 +177,7 @@ def test_real_clips(data_dir):
     assert told.frames == load_motion(slow, source_fps=60).num_frames
 
 
-def test_the_command_looks_at_motions_beside_garments(body, rest, walk, tmp_path, capsys):
+def test_inspect_command_accepts_motions_and_garments(body, rest, walk, tmp_path, capsys):
     short = dataclasses.replace(walk, root=walk.root[:8], rotations=walk.rotations[:8])
     save_motion(tmp_path / "walk.npz", short)
     _write_gltf(tmp_path / "walk.glb", body, rest, short)
@@ -202,14 +200,14 @@ def test_the_command_looks_at_motions_beside_garments(body, rest, walk, tmp_path
     assert "8 at 30 a second" in capsys.readouterr().out
 
 
-def test_a_problem_is_an_exit_code(walk, tmp_path, capsys):
+def test_motion_problems_set_the_exit_code(walk, tmp_path, capsys):
     far = np.asarray(walk.root).copy()
     far[50:] += [0.0, 0.0, 3.0]
     save_motion(tmp_path / "a.npz", dataclasses.replace(walk, root=jnp.asarray(far)))
     assert main(["inspect", str(tmp_path / "a.npz")]) == 1
-    assert "wrong: its hips go at" in capsys.readouterr().out
+    assert "wrong: its hips move at" in capsys.readouterr().out
 
 
-def test_what_is_said_of_motions_is_not_ignored_for_a_garment(capsys):
+def test_motion_options_are_refused_for_a_garment(capsys):
     assert main(["inspect", "shirt.obj", "--source-fps", "60"]) == 2
     assert "--source-fps is for motions" in " ".join(capsys.readouterr().err.split())

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from physxnet_jax.body import bone_directions
 from physxnet_jax.errors import MotionError
-from physxnet_jax.geometry import quaternion_multiply
+from physxnet_jax.geometry import quaternion_multiply, slerp
 from physxnet_jax.motion import (
     CLIPS,
     _procedural,
@@ -21,7 +21,6 @@ from physxnet_jax.motion import (
     make_motion,
     resample,
     save_motion,
-    slerp,
     sudden_turns,
 )
 
@@ -33,7 +32,7 @@ from physxnet_jax.motion import (
     st.floats(0, 1),
     st.booleans(),
 )
-def test_slerp_takes_the_short_way_at_constant_speed(a, b, t, flip):
+def test_slerp_takes_the_shortest_path_at_constant_speed(a, b, t, flip):
     ra, rb = Rotation.from_rotvec(a), Rotation.from_rotvec(b)
     qa, qb = ra.as_quat(scalar_first=True), rb.as_quat(scalar_first=True)
     q = slerp(qa, -qb if flip else qb, np.array([t]))
@@ -54,7 +53,7 @@ def turning(frames, fps):
 
 
 @pytest.mark.parametrize("fps", [24.0, 30.0, 60.0, 240.0])
-def test_a_uniform_turn_resamples_exactly(fps):
+def test_uniform_rotation_resamples_exactly(fps):
     out = resample(turning(121, 120.0), fps)
     assert out.num_frames == int(fps) + 1
     expected = Rotation.from_rotvec(np.outer(np.arange(out.num_frames) / fps, [0, 1.5, 0]))
@@ -87,14 +86,14 @@ def hips(clip):
 
 @pytest.mark.parametrize("name", [n for n in CLIPS if n != "jump"])
 @pytest.mark.parametrize("fps", [30.0, 60.0])
-def test_hips_glide_from_one_foot_to_the_other(name, fps):
+def test_hip_acceleration_is_bounded_in_built_in_clips(name, fps):
     along, up = hips(load_motion(name, fps=fps))
     assert along < 8.0 and up < 13.0
 
 
-def test_hips_that_follow_the_standing_foot_at_once_are_jerked(monkeypatch):
-    monkeypatch.setattr(_procedural, "_GLIDE", 1e-3)
-    monkeypatch.setattr(_procedural, "_RISE", 1e-3)
+def test_hip_acceleration_exceeds_the_bound_without_smoothing(monkeypatch):
+    monkeypatch.setattr(_procedural, "_SIGMA_XZ", 1e-3)
+    monkeypatch.setattr(_procedural, "_SIGMA_Y", 1e-3)
     along, up = hips(load_motion("walk", fps=30.0))
     assert along > 20.0 and up > 15.0
 
@@ -106,12 +105,12 @@ def test_built_in_clips_are_the_same_at_every_rate(name):
     np.testing.assert_allclose(often.rotations[::3], seldom.rotations, atol=1e-6)
 
 
-def test_a_walk_goes_forward_all_the_time():
+def test_walk_always_moves_forward():
     ahead = np.diff(np.asarray(load_motion("walk", fps=30.0).root)[:, 2]) * 30.0
     assert 0.4 < ahead.min() and ahead.max() < 1.6
 
 
-def test_round_trip_through_npz(tmp_path):
+def test_motion_round_trips_through_npz(tmp_path):
     motion = turning(10, 30.0)
     save_motion(tmp_path / "m.npz", motion)
     again = load_motion(tmp_path / "m.npz")
@@ -119,7 +118,7 @@ def test_round_trip_through_npz(tmp_path):
     assert again.fps == 30.0 and not list(tmp_path.glob("*.part"))
 
 
-def test_a_rate_that_would_fill_the_memory_is_refused():
+def test_rates_that_need_too_many_frames_are_refused():
     slow = dataclasses.replace(turning(5, 30.0), fps=1e-8)
     with pytest.raises(MotionError, match="true rate"):
         resample(slow, 30.0)
@@ -136,14 +135,14 @@ def test_a_rate_that_would_fill_the_memory_is_refused():
         (lambda r, p: (r[:0], p[:0], 30.0), "at least one frame"),
     ],
 )
-def test_bad_arrays_are_refused(spoil, says):
+def test_invalid_motion_arrays_are_refused(spoil, says):
     r = np.zeros((3, 31, 4))
     r[..., 0] = 1
     with pytest.raises(MotionError, match=says):
         make_motion(*spoil(r, np.zeros((3, 3))))
 
 
-def test_limbs_that_turn_over_within_a_frame_are_told_of(body):
+def test_sudden_limb_turns_are_reported(body):
     for name in CLIPS:
         assert sudden_turns(body, load_motion(name, fps=30)) is None, name
     walk = load_motion("walk", fps=60)
@@ -161,7 +160,7 @@ def test_limbs_that_turn_over_within_a_frame_are_told_of(body):
     assert sudden_turns(body, slow) is None
 
 
-def test_a_person_of_another_shape_stands_as_straight(body):
+def test_built_in_clips_start_with_straight_legs_for_other_shapes(body):
     """Built-in clips begin on straight legs, whatever way a shape's bones lean at rest."""
     shape = body.shape(gender=1.0, weight_up=1.0, height_up=0.8)
     clip = load_motion("stretch", fps=10.0, shape=shape)
@@ -174,7 +173,7 @@ def test_a_person_of_another_shape_stands_as_straight(body):
     assert np.abs(ours - usual)[legs].max() > 5e-3
 
 
-def test_a_saved_motion_stands_on_the_floor_in_another_shape(body, tmp_path):
+def test_saved_motion_stands_on_the_floor_for_other_shapes(body, tmp_path):
     save_motion(tmp_path / "w.npz", load_motion("walk", fps=10))
     usual = load_motion(tmp_path / "w.npz")
     for shape in (body.shape(height_up=1.0), body.shape(height_down=1.0)):
@@ -195,7 +194,7 @@ def amass(path, pose, way, *, height=0.0, steps=60):
 
 
 @pytest.mark.parametrize("degrees", [0.0, 90.0, 180.0, 270.0])
-def test_who_crawls_in_a_file_of_amass_lies_whichever_way(body, rest, tmp_path, degrees):
+def test_crawling_amass_motion_stays_prone_for_any_heading(body, rest, tmp_path, degrees):
     """Z is up there: prone, with the head along the floor."""
     heading = Rotation.from_euler("z", degrees, degrees=True)
     prone = heading * Rotation.from_euler("x", 170.0, degrees=True)
@@ -208,7 +207,7 @@ def test_who_crawls_in_a_file_of_amass_lies_whichever_way(body, rest, tmp_path, 
     assert np.ptp(np.asarray(clip.root)[:, 1]) < 0.15
 
 
-def test_files_of_the_layout_of_amass_may_have_y_up(body, rest, tmp_path):
+def test_amass_files_with_y_up_are_detected(body, rest, tmp_path):
     """Standing, walking, and on the stairs: no floor along Z is taken for one."""
     upright = Rotation.identity()
     for way in ([0.0, 0, 0], [0.0, 0, 1.5], [1.0, 0.6, 0.4]):
@@ -227,7 +226,7 @@ def test_files_of_the_layout_of_amass_may_have_y_up(body, rest, tmp_path):
         ("own.npz", {"skeleton": "none.asf"}, "for .amc files"),
     ],
 )
-def test_what_a_motion_has_no_use_for_is_refused(tmp_path, name, told, says):
+def test_options_unused_by_a_motion_are_refused(tmp_path, name, told, says):
     if name.endswith(".npz"):
         save_motion(tmp_path / name, load_motion("walk", fps=5))
         name = tmp_path / name

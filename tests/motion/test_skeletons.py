@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from physxnet_jax.body import t_pose
 from physxnet_jax.errors import MotionError
 from physxnet_jax.motion import (
     JOINT_MAPS,
@@ -112,7 +113,7 @@ PREFIXES |= {"character-creator": "CC_Base_", "vrm": "Avatar.", "unreal-4": "ue4
 
 
 @pytest.mark.parametrize("family", sorted(JOINT_MAPS.keys() - {"cmu-asf", "cmu-daz"}))
-def test_a_walk_in_the_names_of_others_is_the_same_walk(body, rest, tmp_path, family):
+def test_walk_round_trips_through_every_joint_naming(body, rest, tmp_path, family):
     walk = procedural_clip("walk", fps=15.0)
     odd = along_bones(body, rest) if family == X_ALONG_BONE else None
     path = tmp_path / "a.bvh"
@@ -129,7 +130,7 @@ def test_a_walk_in_the_names_of_others_is_the_same_walk(body, rest, tmp_path, fa
     np.testing.assert_allclose(again.root, walk.root, atol=0.05 if odd else 0.01)
 
 
-def test_a_skeleton_that_stands_along_z_is_turned_upright(body, rest, tmp_path):
+def test_skeleton_along_z_is_turned_upright(body, rest, tmp_path):
     walk = procedural_clip("walk", fps=15.0)
     z_up = Rotation.from_euler("X", 90, degrees=True).as_matrix()
     path = tmp_path / "a.bvh"
@@ -143,9 +144,7 @@ def test_a_skeleton_that_stands_along_z_is_turned_upright(body, rest, tmp_path):
 
 @pytest.mark.parametrize("angle", [180.0, 90.0, -90.0])
 @pytest.mark.parametrize("z_up", [False, True])
-def test_whichever_way_a_skeleton_faces_at_rest_its_walk_is_the_same(
-    body, rest, tmp_path, angle, z_up
-):
+def test_rest_heading_of_a_skeleton_does_not_change_the_walk(body, rest, tmp_path, angle, z_up):
     walk = procedural_clip("walk", fps=15.0)
     turn = Rotation.from_euler("Y", angle, degrees=True)
     stood = Rotation.from_euler("X", 90 if z_up else 0, degrees=True)
@@ -164,7 +163,7 @@ def test_whichever_way_a_skeleton_faces_at_rest_its_walk_is_the_same(
     assert limbs < 0.1 and turns < 3.0
 
 
-def test_joints_that_move_in_their_parents_are_followed(body, rest, tmp_path):
+def test_joint_translations_are_applied(body, rest, tmp_path):
     walk = procedural_clip("walk", fps=15.0)
     path = tmp_path / "a.bvh"
     path.write_text(bvh(body, rest, walk, JOINT_MAPS["mixamo"], moving=True))
@@ -172,7 +171,7 @@ def test_joints_that_move_in_their_parents_are_followed(body, rest, tmp_path):
     assert limbs < 0.1 and turns < 3.0
 
 
-def test_prefixes_and_missing_toes_and_spines_are_bridged(body, rest, tmp_path):
+def test_prefixed_names_and_missing_joints_are_handled(body, rest, tmp_path):
     walk = procedural_clip("walk", fps=10.0)
     few = {b: s for b, s in JOINT_MAPS["mixamo"].items() if "Toe" not in b and b != "Spine1"}
     path = tmp_path / "a.bvh"
@@ -183,7 +182,7 @@ def test_prefixes_and_missing_toes_and_spines_are_bridged(body, rest, tmp_path):
     assert limbs < 0.1
 
 
-def test_a_joint_map_of_ones_own_is_read_from_a_file(body, rest, tmp_path):
+def test_custom_joint_map_is_read_from_a_file(body, rest, tmp_path):
     walk = procedural_clip("walk", fps=10.0)
     strange = {b: f"bone{n}" for n, b in enumerate(JOINT_MAPS["mixamo"])}
     path = tmp_path / "a.bvh"
@@ -196,7 +195,7 @@ def test_a_joint_map_of_ones_own_is_read_from_a_file(body, rest, tmp_path):
     assert limbs < 0.1
 
 
-def test_a_map_of_a_few_names_completes_what_is_known(body, rest, tmp_path):
+def test_partial_joint_map_completes_the_known_names(body, rest, tmp_path):
     """Four renamed joints, told; the spine and the neck are still known by their names."""
     walk = procedural_clip("walk", fps=10.0)
     odd = {"LeftUpLeg": "thighA", "RightUpLeg": "thighB", "LeftArm": "armA", "RightArm": "armB"}
@@ -208,17 +207,19 @@ def test_a_map_of_a_few_names_completes_what_is_known(body, rest, tmp_path):
     np.testing.assert_allclose(again.rotations, load_motion(whole).rotations, atol=1e-6)
     with pytest.raises(MotionError, match=r"the joint map lacks LeftArm, RightArm\. Map"):
         load_motion(path, joint_map={k: v for k, v in odd.items() if "Leg" in k})
-    with pytest.raises(MotionError, match="has Tail, which the body hasn't"):
+    with pytest.raises(MotionError, match="has Tail, which the body lacks"):
         load_motion(path, joint_map=odd | {"Tail": "armA"})
 
 
-def test_the_way_from_a_t_pose_isnt_gone(body, rest, tmp_path):
+def test_blend_from_the_initial_t_pose_is_removed(body, rest, tmp_path):
     """A conversion that blends from its T-pose in five frames: the clip begins as it goes on."""
     walk = procedural_clip("walk", fps=30.0)
     q = np.asarray(walk.rotations, np.float64)
-    t_pose = np.asarray(body.t_pose(body.default_shape()), np.float64)
+    stretched = np.asarray(t_pose(body, body.default_shape()), np.float64)
     share = np.array([0.0, 0.5, 0.8, 0.92, 0.97])[:, None, None]
-    blend = (1 - share) * t_pose * np.sign((t_pose * q[:5]).sum(-1, keepdims=True)) + share * q[:5]
+    blend = (1 - share) * stretched * np.sign(
+        (stretched * q[:5]).sum(-1, keepdims=True)
+    ) + share * q[:5]
     blend /= np.linalg.norm(blend, axis=-1, keepdims=True)
     blend[0, 0] = [1.0, 0.0, 0.0, 0.0]
     mixed = make_motion(np.concatenate([blend, q[5:]]), walk.root, 30.0)
@@ -235,7 +236,9 @@ def test_the_way_from_a_t_pose_isnt_gone(body, rest, tmp_path):
             body,
             rest,
             make_motion(
-                np.concatenate([t_pose[None], q]), np.concatenate([walk.root[:1], walk.root]), 30.0
+                np.concatenate([stretched[None], q]),
+                np.concatenate([walk.root[:1], walk.root]),
+                30.0,
             ),
             JOINT_MAPS["cmu-motionbuilder"],
         )
@@ -252,7 +255,7 @@ def test_broken_joint_maps_are_refused(tmp_path, text):
         read_joint_map(path)
 
 
-def test_a_joint_map_that_isnt_text_is_refused(tmp_path):
+def test_non_text_joint_map_is_refused(tmp_path):
     path = tmp_path / "names.toml"
     path.write_bytes(b"\xff\xfe\x00broken")
     with pytest.raises(MotionError, match="joint map"):

@@ -15,11 +15,11 @@ from physxnet_jax.motion import (
     at_speed,
     body_animation,
     exaggerated,
+    extrapolate_history,
     frames_at_speed,
     load_motion,
     mirror_joints,
     mirrored,
-    poses_before,
     with_upper_body,
 )
 
@@ -28,7 +28,7 @@ def skin(motion):
     return np.asarray(body_animation(load_body(), motion))[:, :NUM_BODY_VERTICES]
 
 
-def test_the_skin_of_a_mirrored_motion_is_the_mirrored_skin():
+def test_mirrored_motion_gives_the_mirrored_skin():
     body = load_body()
     motion = load_motion("punch", fps=30.0)
     # Thumbs are bent by hand: no file of motion does it.
@@ -46,7 +46,7 @@ def test_the_skin_of_a_mirrored_motion_is_the_mirrored_skin():
     assert np.linalg.norm(seen - skin(motion), axis=2).max() > 0.3
 
 
-def test_a_mirror_twice_is_no_mirror():
+def test_mirroring_twice_restores_the_motion():
     body, motion = load_body(), load_motion("walk", fps=30.0)
     back = mirrored(body, mirrored(body, motion))
     np.testing.assert_allclose(back.rotations, motion.rotations, atol=1e-6)
@@ -63,7 +63,7 @@ def test_a_mirror_twice_is_no_mirror():
         mirror_joints(lame)
 
 
-def test_twice_as_fast_is_every_second_frame():
+def test_double_speed_keeps_every_second_frame():
     motion = load_motion("walk", fps=30.0)
     fast = at_speed(motion, 2.0)
     np.testing.assert_allclose(fast.root, motion.root[::2], atol=1e-5)
@@ -84,7 +84,7 @@ def angles(motion, joint):
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.25])
-def test_exaggeration_turns_joints_that_much_further_from_their_mean(factor):
+def test_exaggeration_scales_joint_angles_about_their_mean(factor):
     motion = load_motion("walk", fps=30.0)
     wide = exaggerated(motion, factor)
     for name in ("LeftUpLeg", "RightForeArm"):
@@ -96,7 +96,7 @@ def test_exaggeration_turns_joints_that_much_further_from_their_mean(factor):
     np.testing.assert_array_equal(wide.rotations[:, 0], motion.rotations[:, 0])
 
 
-def test_no_exaggeration_is_the_motion_and_a_huge_one_is_bounded():
+def test_exaggeration_by_one_is_identity_and_a_large_one_is_bounded():
     motion = load_motion("punch", fps=30.0)
     same = exaggerated(motion, 1.0)
     dots = np.abs(np.sum(np.asarray(same.rotations) * np.asarray(motion.rotations), axis=2))
@@ -111,7 +111,7 @@ def test_no_exaggeration_is_the_motion_and_a_huge_one_is_bounded():
         exaggerated(motion, -1.0)
 
 
-def test_another_upper_body_leaves_the_legs_and_plays_to_and_fro():
+def test_with_upper_body_keeps_the_legs_and_plays_back_and_forth():
     body = load_body()
     walk, punch = load_motion("walk", fps=30.0), load_motion("punch", fps=30.0)
     short = dataclasses.replace(punch, rotations=punch.rotations[:4], root=punch.root[:4])
@@ -134,9 +134,9 @@ def test_another_upper_body_leaves_the_legs_and_plays_to_and_fro():
         with_upper_body(still, walk, punch)
 
 
-def test_what_was_before_a_clip_goes_on_into_it():
+def test_extrapolated_history_has_constant_velocity():
     clip = load_motion("walk", fps=60.0)
-    q, p = poses_before(clip.rotations, clip.root, 5)
+    q, p = extrapolate_history(clip.rotations, clip.root, 5)
     assert q.shape == (5, 31, 4) and p.shape == (5, 3)
     # At one speed from the oldest of them to the clip's second pose.
     way = np.concatenate([p, clip.root[:2]])
@@ -148,9 +148,9 @@ def test_what_was_before_a_clip_goes_on_into_it():
     steps = [(a.inv() * b).as_matrix() for a, b in itertools.pairwise(turns)]
     np.testing.assert_allclose(steps, [steps[-1]] * 6, atol=1e-5)
     assert np.abs(steps[-1] - np.eye(3)).max() > 0.01
-    one = poses_before(clip.rotations[:1], clip.root[:1], 3)
+    one = extrapolate_history(clip.rotations[:1], clip.root[:1], 3)
     np.testing.assert_allclose(one[1], np.tile(clip.root[:1], (3, 1)), atol=1e-6)
     assert np.abs(np.abs(np.sum(np.asarray(one[0] * clip.rotations[:1]), axis=-1)) - 1).max() < 1e-5
-    assert poses_before(clip.rotations, clip.root, 0)[0].shape == (0, 31, 4)
-    spoiled = poses_before(clip.rotations.at[1].set(np.nan), clip.root, 5)
+    assert extrapolate_history(clip.rotations, clip.root, 0)[0].shape == (0, 31, 4)
+    spoiled = extrapolate_history(clip.rotations.at[1].set(np.nan), clip.root, 5)
     assert np.isfinite(np.asarray(spoiled[0])).all() and np.isfinite(np.asarray(spoiled[1])).all()

@@ -11,20 +11,23 @@ from physxnet_jax.errors import SimulationError
 from physxnet_jax.garment import Fabric, square_sheet
 from physxnet_jax.simulation import (
     XPBD,
+    Implicit,
+    Scene,
+    State,
+    Verlet,
+    advance,
+    make_system,
+    prepare_scene,
+    start_state,
+)
+from physxnet_jax.simulation.effects import (
     Bend,
     BodyContact,
     Dihedral,
     Gravity,
-    Implicit,
     Membrane,
     Pin,
-    Scene,
-    State,
     Stretch,
-    Verlet,
-    advance,
-    prepare_scene,
-    start_state,
 )
 
 FPS = 30.0
@@ -54,12 +57,13 @@ def roll(scene, solver, *, tilt, frames=4, **factors):
     root = jnp.repeat(heads[:1][None].astype(dtype), frames + 1, axis=0)
     x = jnp.asarray(scene.assembly.rest.astype(dtype))[:, :, None]
     state = State(x, jnp.zeros_like(x))
-    system = scene.system(solver).rescaled(**factors)
+    system = make_system(scene, solver).rescaled(**factors)
     _, moved, info = advance(system, state, pose, root, solver=solver, fps=FPS)
     return moved[-1, :, :, 0], info
 
 
-def test_gradients_through_contact_agree_with_differences(draped):
+@pytest.mark.release
+def test_gradients_through_contact_match_finite_differences(draped):
     """By bending stiffness, friction and pose, in float32; differences in float64, whose
     steps are so short that no vertex changes its triangle within one."""
     at = {"bend": 1.0, "friction": 1.0, "tilt": 0.3}
@@ -79,7 +83,8 @@ def test_gradients_through_contact_agree_with_differences(draped):
             assert abs(difference) > 1e-5, name
 
 
-def test_the_kerchief_touches(draped):
+@pytest.mark.release
+def test_kerchief_is_in_contact_with_the_head(draped):
     """Control: without contact the test above would test free fall."""
     x, info = roll(draped, STEPS, tilt=jnp.float32(0.3))
     assert info["inside_share"].max() < 0.05
@@ -87,20 +92,20 @@ def test_the_kerchief_touches(draped):
     assert np.abs(np.asarray(x - still)).max() > 0.02
 
 
-def test_other_parameters_are_refused(draped):
+def test_unknown_rescaling_parameters_are_refused(draped):
     with pytest.raises(SimulationError, match="bend, friction, stretch"):
-        draped.system(STEPS).rescaled(colour=1.0)
+        make_system(draped, STEPS).rescaled(colour=1.0)
     sheet = square_sheet(3, 0.2)
     for effects, name in (((Gravity(), Bend()), "stretch"), ((Gravity(), Stretch()), "friction")):
-        system = prepare_scene(Scene((sheet,), effects)).system(STEPS)
+        system = make_system(prepare_scene(Scene((sheet,), effects)), STEPS)
         with pytest.raises(SimulationError, match=f"No effect of this scene has {name}"):
             system.rescaled(**{name: 2.0})
 
 
 @pytest.mark.parametrize("factor", [-0.5, float("nan"), float("inf")])
 @pytest.mark.parametrize("name", ["stretch", "bend", "friction"])
-def test_factors_that_mean_nothing_are_refused(draped, name, factor):
-    system = draped.system(STEPS)
+def test_invalid_rescaling_factors_are_refused(draped, name, factor):
+    system = make_system(draped, STEPS)
     with pytest.raises(SimulationError, match="expected a"):
         system.rescaled(**{name: factor})
     if name == "friction":
@@ -110,12 +115,13 @@ def test_factors_that_mean_nothing_are_refused(draped, name, factor):
             system.rescaled(**{name: jnp.float32(0.0)})
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize(
     "solver",
     [XPBD(8, 2), Implicit(8, 2), Implicit(8, 2, order=1), Verlet(256, 2, precision="float32")],
 )
 @pytest.mark.parametrize("elastic", [(Stretch(), Bend()), (Membrane(), Bend())])
-def test_a_rescaled_scene_is_the_scene_made_of_that_cloth(solver, elastic, body, rest):
+def test_rescaled_scene_matches_a_scene_of_that_fabric(solver, elastic, body, rest):
     """Forces, and what a solver keeps of stiffnesses, change together."""
     pose = jnp.repeat(body.a_pose()[None, None], 5, axis=0)
     root = jnp.repeat(body.joint_positions(rest)[0][:1][None], 5, axis=0)
@@ -123,7 +129,7 @@ def test_a_rescaled_scene_is_the_scene_made_of_that_cloth(solver, elastic, body,
     def roll(fabric, **factors):
         g = square_sheet(6, 0.2, pinned=np.arange(6), fabric=fabric)
         scene = prepare_scene(Scene((g,), (Gravity(), *elastic, Pin())))
-        system = scene.system(solver).rescaled(**factors)
+        system = make_system(scene, solver).rescaled(**factors)
         x = jnp.asarray(g.mesh.vertices)[:, :, None]
         state = start_state(system, x, solver=solver, fps=FPS)
         return np.asarray(advance(system, state, pose, root, solver=solver, fps=FPS)[1])
@@ -133,13 +139,13 @@ def test_a_rescaled_scene_is_the_scene_made_of_that_cloth(solver, elastic, body,
     assert np.abs(made - told).max() < 2e-5 and np.abs(made - plain).max() > 2e-3
 
 
-@pytest.mark.slow
-def test_a_bending_stiffness_is_recovered_from_motion(body, rest):
+@pytest.mark.nightly
+def test_bending_stiffness_is_recovered_from_motion(body, rest):
     """Newton on its logarithm, by gradients alone: within 5 per cent of the truth."""
     fabric = Fabric(stretch=500.0, bend=2e-4)
     g = square_sheet(7, 0.2, pinned=np.arange(7), fabric=fabric)
     scene = prepare_scene(Scene((g,), (Gravity(), Stretch(), Bend(), Pin())))
-    system = scene.system(STEPS)
+    system = make_system(scene, STEPS)
     pose = jnp.repeat(body.a_pose()[None, None], 9, axis=0)
     root = jnp.repeat(body.joint_positions(rest)[0][:1][None], 9, axis=0)
     x = jnp.asarray(scene.assembly.rest.astype(np.float32))[:, :, None]
@@ -162,7 +168,7 @@ def test_a_bending_stiffness_is_recovered_from_motion(body, rest):
     assert float(jnp.exp(at)) == pytest.approx(3.0, rel=0.05)
 
 
-def test_a_rougher_cloth_is_that_of_a_factor_of_friction(body, rest):
+def test_rescaled_friction_matches_a_fabric_of_that_friction(body, rest):
     """The kerchief on a head that tilts: twice the friction told is twice the friction made."""
     skin = np.asarray(rest, np.float64)[:13380]
     crown = skin[skin[:, 1].argmax()]
@@ -178,7 +184,7 @@ def test_a_rougher_cloth_is_that_of_a_factor_of_friction(body, rest):
         fabric = Fabric(stretch=200.0, bend=1e-4, friction=rub)
         g = square_sheet(5, 0.18, corner=corner, fabric=fabric)
         scene = prepare_scene(Scene((g,), (Gravity(), Stretch(), Bend(), BodyContact())))
-        system = scene.system(STEPS).rescaled(**factors)
+        system = make_system(scene, STEPS).rescaled(**factors)
         x = jnp.asarray(g.mesh.vertices)[:, :, None]
         state = State(x, jnp.zeros_like(x))
         return np.asarray(advance(system, state, pose, root, solver=STEPS, fps=FPS)[1])
@@ -187,14 +193,15 @@ def test_a_rougher_cloth_is_that_of_a_factor_of_friction(body, rest):
     assert np.abs(made - told).max() < 1e-5 and np.abs(made - plain).max() > 1e-3
 
 
-def test_a_factor_of_bending_is_that_of_dihedral_cloth_too(body, rest):
+@pytest.mark.release
+def test_rescaled_bending_matches_dihedral_fabric(body, rest):
     pose = jnp.repeat(body.a_pose()[None, None], 5, axis=0)
     root = jnp.repeat(body.joint_positions(rest)[0][:1][None], 5, axis=0)
 
     def roll(fabric, **factors):
         g = square_sheet(6, 0.2, pinned=np.arange(6), fabric=fabric)
         scene = prepare_scene(Scene((g,), (Gravity(), Membrane(), Dihedral(), Pin())))
-        system = scene.system(STEPS).rescaled(**factors)
+        system = make_system(scene, STEPS).rescaled(**factors)
         x = jnp.asarray(g.mesh.vertices)[:, :, None]
         state = start_state(system, x, solver=STEPS, fps=FPS)
         return np.asarray(advance(system, state, pose, root, solver=STEPS, fps=FPS)[1])

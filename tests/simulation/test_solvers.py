@@ -11,24 +11,20 @@ from physxnet_jax.errors import SimulationError
 from physxnet_jax.garment import Fabric, square_sheet
 from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import (
-    ACCURACY,
+    PRESETS,
     XPBD,
-    Bend,
-    Dihedral,
-    Gravity,
     Implicit,
-    Membrane,
-    Pin,
     Scene,
     State,
     Status,
-    Stretch,
     Verlet,
     advance,
+    make_system,
     prepare_scene,
+    settle_on_static_body,
     simulate,
-    simulate_still,
 )
+from physxnet_jax.simulation.effects import Bend, Dihedral, Gravity, Membrane, Pin, Stretch
 
 SOFT = Fabric(stretch=300.0, bend=1e-5, warp=300.0, weft=300.0, shear=50.0)
 
@@ -46,17 +42,18 @@ def rms(a, b):
 
 
 def last(scene, solver, frames=5):
-    return simulate_still(scene, frames, solver=solver).positions[0][-1].astype(np.float64)
+    return settle_on_static_body(scene, frames, solver=solver).positions[0][-1].astype(np.float64)
 
 
 @pytest.fixture(scope="module")
 def reference():
     scene = swinging()
-    fine, coarse = (last(scene, Verlet(substeps=n, queries=1)) for n in (1024, 512))
+    fine, coarse = (last(scene, Verlet(substeps=n, contact_updates=1)) for n in (1024, 512))
     assert rms(fine, coarse) < 1e-7, "the reference agrees with itself"
     return scene, fine
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("make", "order", "within", "substeps"),
     [
@@ -71,33 +68,34 @@ def reference():
     ],
     ids=["xpbd", "backward-euler", "bdf2"],
 )
-def test_order_of_convergence(reference, make, order, within, substeps):
+def test_solvers_reach_their_order_of_convergence(reference, make, order, within, substeps):
     scene, truth = reference
     error = [rms(last(scene, make(n)), truth) for n in substeps]
     fitted = -np.polyfit(np.log2(substeps), np.log2(error), 1)[0]
     assert fitted == pytest.approx(order, abs=within), error
 
 
-def test_doing_nothing_is_the_worst_of_all(reference):
+def test_free_fall_baseline_has_the_largest_error(reference):
     """The comparison itself: a sheet that only falls must land far off."""
     scene, truth = reference
     free = dataclasses.replace(scene, effects=scene.effects[:1])
     assert rms(last(free, XPBD(32, 1)), truth) > 100 * rms(last(scene, XPBD(32, 4)), truth)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_solvers_agree_on_membrane_and_dihedral_bending():
     scene = swinging((Membrane(), Dihedral()))
-    truth = last(scene, Verlet(substeps=512, queries=1), 2)
+    truth = last(scene, Verlet(substeps=512, contact_updates=1), 2)
     moved = rms(truth, scene.assembly.rest)
     for solver in (XPBD(64, 4), Implicit(32, 1, order=2, newton=2)):
         assert rms(last(scene, solver, 2), truth) < 0.02 * moved, solver
 
 
-def test_gradients_by_implicit_differentiation_agree_with_differences():
+@pytest.mark.release
+def test_implicit_gradients_match_finite_differences():
     scene = swinging()
     solver = Implicit(8, 1, order=2, newton=2, tolerance=1e-6)
-    system = scene.system(solver)
+    system = make_system(scene, solver)
     body = scene.assembly.body
     heads = body.joint_positions(jnp.asarray(scene.assembly.rest_body, jnp.float32))[0]
     pose = jnp.repeat(body.a_pose()[None, None], 3, axis=0)
@@ -106,7 +104,7 @@ def test_gradients_by_implicit_differentiation_agree_with_differences():
 
     def height(lift):
         v = jnp.zeros_like(x).at[:, 1].set(lift)
-        state = State(x, v, solver.remember(v, 1 / (30.0 * 8)))
+        state = State(x, v, solver.init_state(v, 1 / (30.0 * 8)))
         _, moved, _ = advance(system, state, pose, root, solver=solver, fps=30.0)
         return moved[-1, :, 1].mean()
 
@@ -116,28 +114,29 @@ def test_gradients_by_implicit_differentiation_agree_with_differences():
     assert slope == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.02)
 
 
-def test_cloth_does_not_depend_on_how_many_frames_are_asked_for():
+@pytest.mark.release
+def test_solver_at_rate_makes_cloth_independent_of_the_frame_rate():
     scene, draft = swinging(), XPBD(8, 2)
     assert draft.at_rate(30.0) == draft and draft.at_rate(240.0) == XPBD(4, 1)
-    often = simulate_still(scene, 6, solver=draft).positions[0]
+    often = settle_on_static_body(scene, 6, solver=draft).positions[0]
     for solver, same in ((draft.at_rate(10.0), True), (draft, False)):
-        seldom = simulate_still(scene, 2, solver=solver, fps=10.0).positions[0]
+        seldom = settle_on_static_body(scene, 2, solver=solver, fps=10.0).positions[0]
         assert (np.abs(seldom - often[2::3]).max() < 1e-5) == same
 
 
 @pytest.mark.parametrize("order", [1, 2])
-def test_a_step_of_a_second_stays_finite(order):
+def test_implicit_steps_of_one_second_are_finite(order):
     scene = swinging()
-    out = simulate_still(scene, 5, solver=Implicit(1, 1, order=order, newton=3), fps=1.0)
+    out = settle_on_static_body(scene, 5, solver=Implicit(1, 1, order=order, newton=3), fps=1.0)
     assert out.finite.all() and np.abs(out.positions[0]).max() < 10
 
 
-def test_float64_stays_inside():
+def test_float64_solver_does_not_change_the_global_precision():
     last(swinging(), XPBD(4, 1, "float64"), 1)
     assert jnp.zeros(2).dtype == jnp.float32
 
 
-def test_settings_that_make_no_sense_are_refused():
+def test_invalid_solver_settings_are_refused():
     for wrong in (
         lambda: XPBD(10, 4),
         lambda: XPBD(8, 2, "float16"),
@@ -148,31 +147,32 @@ def test_settings_that_make_no_sense_are_refused():
             wrong()
     with pytest.raises(SimulationError, match="accuracy"):
         simulate(Scene((square_sheet(3),)), load_motion("balance", fps=30.0), accuracy="best")
-    assert ACCURACY["draft"].substeps < ACCURACY["fine"].substeps
+    assert PRESETS["draft"].substeps < PRESETS["fine"].substeps
 
 
-def test_status_names_frame_and_vertex_of_a_breakdown():
+def test_status_reports_frame_and_vertex_of_non_finite_values():
     g = square_sheet(4, 0.3)
     scene = prepare_scene(Scene((g,), (Gravity(), Stretch())))
     x = np.asarray(g.mesh.vertices).copy()
     x[5] = np.nan
-    out = simulate_still(scene, 2, solver=XPBD(4, 1), start=x)
+    out = settle_on_static_body(scene, 2, solver=XPBD(4, 1), start=x)
     assert (out.status & Status.NONFINITE).all()
     with pytest.raises(SimulationError, match="frame 0, vertex"):
         out.check()
-    fine = simulate_still(scene, 2, solver=XPBD(4, 1))
+    fine = settle_on_static_body(scene, 2, solver=XPBD(4, 1))
     assert not fine.status.any()
     fine.check()
 
 
-def test_energies_are_given_only_if_asked_and_add_up():
+@pytest.mark.nightly
+def test_energies_are_optional_and_conserved():
     scene = swinging()
-    out = simulate_still(scene, 10, solver=Verlet(512, 1), energies=True)
+    out = settle_on_static_body(scene, 10, solver=Verlet(512, 1), energies=True)
     d = out.diagnostics
     mass = scene.assembly.mass
     free = ~scene.assembly.pinned
     height = (out.positions[0][:, free, 1] - scene.assembly.rest[free, 1]) @ mass[free]
     total = d["energy_kinetic"] + d["energy_stretch"] + d["energy_bend"] + 9.81 * height
     assert np.ptp(total) < 0.01 * d["energy_kinetic"].max()
-    plain = simulate_still(scene, 1, solver=XPBD(4, 1)).diagnostics
+    plain = settle_on_static_body(scene, 1, solver=XPBD(4, 1)).diagnostics
     assert not any(k.startswith("energy") for k in plain)

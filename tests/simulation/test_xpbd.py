@@ -14,22 +14,18 @@ from physxnet_jax.geometry import mesh_edges
 from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import (
     XPBD,
-    Bend,
-    BodyContact,
-    Damping,
-    Gravity,
-    Pin,
     Scene,
     State,
-    Stretch,
     _rollout,
     advance,
-    lead_in,
+    make_system,
     prepare_scene,
+    settle_on_static_body,
     simulate,
     simulate_batch,
-    simulate_still,
+    warmup,
 )
+from physxnet_jax.simulation.effects import Bend, BodyContact, Damping, Gravity, Pin, Stretch
 
 FPS = 30.0
 
@@ -51,11 +47,13 @@ def roll(garment, effects, frames, solver=None, start=None, shift=(0.0, 0.0, 0.0
     """Positions of every frame, with the body standing still, and diagnostics."""
     scene = prepare_scene(Scene((garment,), effects))
     start = None if start is None else np.asarray(start)
-    out = simulate_still(scene, frames, solver=solver or XPBD(16, 2), start=start, shift=shift)
+    out = settle_on_static_body(
+        scene, frames, solver=solver or XPBD(16, 2), start=start, shift=shift
+    )
     return out.positions[0], out.diagnostics
 
 
-def test_free_fall_is_exact_to_the_order_of_the_step():
+def test_free_fall_matches_symplectic_euler():
     g = sheet()
     moved, info = roll(g, (Gravity(), Stretch(), Bend()), 15, XPBD(32, 4))
     t = 15 / FPS
@@ -66,13 +64,13 @@ def test_free_fall_is_exact_to_the_order_of_the_step():
     assert info["finite"].all() and info["speed_max"][-1] == pytest.approx(9.81 * t, rel=1e-4)
 
 
-def test_without_gravity_a_sheet_at_rest_stays_bitwise_at_rest():
+def test_sheet_at_rest_stays_at_rest_without_gravity():
     g = sheet()
     moved, _ = roll(g, (Stretch(), Bend()), 3)
     assert np.abs(moved[-1] - np.asarray(g.mesh.vertices)).max() < 1e-6
 
 
-def test_a_pinned_sheet_swings_like_a_pendulum_and_keeps_its_size():
+def test_pinned_sheet_swings_like_a_pendulum_with_bounded_strain():
     n = 6
     g = sheet(n, pinned=np.arange(n))
     moved, info = roll(g, (Gravity(), Stretch(), Bend(), Pin()), 45, XPBD(64, 2))
@@ -85,7 +83,7 @@ def test_a_pinned_sheet_swings_like_a_pendulum_and_keeps_its_size():
     assert crossing == pytest.approx(quarter, rel=0.12)
 
 
-def test_energy_never_grows_from_a_stretched_start():
+def test_speed_and_strain_are_bounded_from_a_stretched_start():
     g = sheet()
     start = jnp.asarray(np.asarray(g.mesh.vertices)) * jnp.array([[1.2, 1.0, 1.0]])
     _, info = roll(g, (Stretch(), Bend()), 30, start=start)
@@ -94,7 +92,7 @@ def test_energy_never_grows_from_a_stretched_start():
     assert info["strain_max"][-1] < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_halving_the_step_halves_the_error():
     g = sheet(5, pinned=np.arange(5))
     effects = (Gravity(), Stretch(), Bend(), Pin())
@@ -105,7 +103,8 @@ def test_halving_the_step_halves_the_error():
     assert orders.mean() == pytest.approx(1.0, abs=0.35), orders
 
 
-def test_small_steps_do_not_lose_to_float32():
+@pytest.mark.release
+def test_small_steps_do_not_lose_accuracy_to_float32():
     """The textbook form gets worse beyond 128 substeps; the compensated one does not."""
     g = sheet(5, pinned=np.arange(5))
     effects = (Gravity(), Stretch(), Bend(), Pin())
@@ -114,7 +113,7 @@ def test_small_steps_do_not_lose_to_float32():
     assert error[256] <= 1.05 * error[128] and error[512] <= 1.05 * error[256]
 
 
-def test_far_from_the_origin_nothing_changes_beyond_rounding():
+def test_translation_changes_the_result_only_by_rounding():
     g = sheet(5)
     effects = (Gravity(), Stretch(), Bend())
     here = roll(g, effects, 10)[0][-1]
@@ -124,7 +123,7 @@ def test_far_from_the_origin_nothing_changes_beyond_rounding():
 
 
 @pytest.mark.parametrize("effect", [Stretch(), Bend(), Gravity(), Damping(), Pin()])
-def test_an_absent_effect_leaves_no_trace(effect):
+def test_absent_effects_are_not_in_the_program(effect):
     """Neither body nor effect is in the program of a scene that doesn't call for them."""
     g = sheet(4)
     scene = prepare_scene(Scene((g,), (effect,)))
@@ -132,7 +131,7 @@ def test_an_absent_effect_leaves_no_trace(effect):
     x = jnp.asarray(scene.assembly.rest.astype(np.float32))[:, :, None]
 
     def program(effects):
-        system = dataclasses.replace(scene.system(XPBD()), effects=effects)
+        system = dataclasses.replace(make_system(scene, XPBD()), effects=effects)
         return str(
             jax.make_jaxpr(lambda s: advance(system, s, pose, root, solver=XPBD(4, 1), fps=FPS))(
                 State(x, jnp.zeros_like(x))
@@ -146,7 +145,8 @@ def test_an_absent_effect_leaves_no_trace(effect):
         assert "einsum" not in with_it and "dot_general" not in with_it, "the body was skinned"
 
 
-def test_an_effect_that_touches_nothing_changes_no_bit():
+@pytest.mark.release
+def test_contact_without_collisions_is_bitwise_neutral():
     """The sheet falls half a metre in front of the body: contact must not be felt."""
     g = sheet(4)
     plain = roll(g, (Gravity(), Stretch(), Bend()), 5)[0]
@@ -154,7 +154,8 @@ def test_an_effect_that_touches_nothing_changes_no_bit():
     np.testing.assert_array_equal(plain, contact)
 
 
-def test_contact_keeps_cloth_on_the_shoulders_and_its_absence_lets_it_through():
+@pytest.mark.release
+def test_cloth_stays_on_the_shoulders_only_with_contact():
     g = template("top")
     motion = load_motion("stretch", fps=FPS)
     short = dataclasses.replace(motion, rotations=motion.rotations[:10], root=motion.root[:10])
@@ -166,7 +167,8 @@ def test_contact_keeps_cloth_on_the_shoulders_and_its_absence_lets_it_through():
     assert worn.positions[0][-1, :, 1].mean() - fallen.positions[0][-1, :, 1].mean() > 0.5
 
 
-def test_batches_agree_with_single_runs():
+@pytest.mark.release
+def test_batched_rollouts_match_single_rollouts():
     from physxnet_jax.simulation import simulate_batch
 
     g = template("bottom")
@@ -184,11 +186,12 @@ def test_batches_agree_with_single_runs():
         assert np.abs(one.positions[0] - alone.positions[0]).max() < 5e-3
 
 
-def test_gradients_through_the_simulation_are_finite_and_right():
+@pytest.mark.release
+def test_gradients_match_finite_differences():
     g = sheet(4, pinned=np.arange(4))
     scene = prepare_scene(Scene((g,), (Gravity(), Stretch(), Bend(), Pin())))
     pose, root = still(2)
-    system = scene.system(XPBD())
+    system = make_system(scene, XPBD())
     x = jnp.asarray(scene.assembly.rest.astype(np.float32))[:, :, None]
 
     def height(lift):
@@ -216,18 +219,18 @@ def test_degenerate_cloth_stays_finite():
     np.testing.assert_allclose(length, rest, rtol=0.05)
 
 
-def test_scenes_and_solvers_refuse_nonsense():
+def test_invalid_scenes_and_solvers_are_refused():
     with pytest.raises(SimulationError, match="needs a garment"):
         prepare_scene(Scene(()))
     with pytest.raises(SimulationError, match="twice"):
         prepare_scene(Scene((sheet(),), (Gravity(), Gravity(g=1.0))))
     with pytest.raises(ValueError, match="multiple"):
-        XPBD(substeps=10, queries=4)
+        XPBD(substeps=10, contact_updates=4)
 
 
-def test_the_lead_in_ends_in_the_first_frame_and_starts_at_rest(body):
+def test_warmup_ends_at_the_first_frame_and_moves_smoothly(body):
     motion = load_motion("punch", fps=FPS)
-    lead = lead_in(body, motion)
+    lead = warmup(body, motion)
     assert lead.num_frames == 45
     q = np.asarray(lead.rotations)
     dot = np.abs((q[-1] * np.asarray(motion.rotations[0])).sum(axis=1))
@@ -237,15 +240,15 @@ def test_the_lead_in_ends_in_the_first_frame_and_starts_at_rest(body):
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.5, 3.0])
-def test_damping_is_an_exponential_decay(rate):
+def test_damping_decays_velocity_exponentially(rate):
     scene = prepare_scene(Scene((square_sheet(4),), (Damping(rate),)))
     v = np.tile([0.0, 2.0, 0.0], (16, 1))
-    out = simulate_still(scene, 15, solver=XPBD(16, 2), velocity=v)
+    out = settle_on_static_body(scene, 15, solver=XPBD(16, 2), velocity=v)
     wanted = 2.0 * np.exp(-rate * np.arange(1, 16) / 30.0)
     np.testing.assert_allclose(out.diagnostics["speed_max"], wanted, rtol=1e-3)
 
 
-def test_pins_go_along_with_the_skin_step_by_step():
+def test_pins_follow_the_skin_in_proportion_to_time():
     """Within a block they have gone as far as time has: no jump at its start."""
     (pin,) = prepare_scene(Scene((square_sheet(4, pinned=np.arange(4)),), (Pin(),))).effects
     where, way = jnp.full((4, 3, 1), 0.5), jnp.ones((4, 3, 1))
@@ -256,7 +259,7 @@ def test_pins_go_along_with_the_skin_step_by_step():
         assert not out[4:].any()
 
 
-def test_time_goes_on_from_block_to_block(monkeypatch):
+def test_time_continues_across_blocks_of_frames(monkeypatch):
     """Wind and gusts are told the clip's time: zero is its first frame, not a block's."""
     seen = []
     real = _rollout.advance
@@ -273,7 +276,7 @@ def test_time_goes_on_from_block_to_block(monkeypatch):
     assert len(seen) > 3
 
 
-def test_what_is_told_of_a_frame_is_of_that_frame():
+def test_diagnostics_of_a_frame_refer_to_that_frame():
     """A sheet that falls from the lead-in's start on: its speed tells when it was looked at."""
     scene = prepare_scene(Scene((square_sheet(3),), (Gravity(),)))
     (out,) = simulate_batch(scene, [load_motion("balance", fps=10.0)], solver=XPBD(2, 1))

@@ -12,7 +12,7 @@ from physxnet_jax.models import Up
 MADE = runpy.run_path(str(pathlib.Path(__file__).parents[2] / "experiments/bench_training.py"))
 
 
-def test_the_plain_layer_is_ours():
+def test_plain_transposed_convolution_matches_the_up_layer():
     for norm in (True, False):
         layer = Up(5, 3, norm=norm, rngs=nnx.Rngs(0))
         x = jax.random.normal(jax.random.key(1), (2, 6, 8, 5))

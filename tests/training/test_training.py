@@ -10,16 +10,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physxnet_jax.data import Sequence
+from physxnet_jax.data import Sequence, batch_indices, is_trainable
+from physxnet_jax.data._frames import MAX_OFFSET, load_frames
+from physxnet_jax.dressing import Inference
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.evaluation import network, skinning
 from physxnet_jax.garment import template
-from physxnet_jax.models import PAPER, Inputs, ModelConfig, make_surface
+from physxnet_jax.models import PAPER, ModelConfig, make_texel_points
 from physxnet_jax.motion import load_motion
 from physxnet_jax.training import (
     TrainConfig,
     adversarial_loss,
-    batch_indices,
     discriminator_loss,
     map_picture,
     masked_l1,
@@ -27,14 +28,13 @@ from physxnet_jax.training import (
     pooled_l1,
     read_metrics,
     soft_labels,
-    teaches,
     train,
     vertex_loss,
 )
-from physxnet_jax.training._batches import MAX_OFFSET, load_frames, target_offsets
 from physxnet_jax.training._checkpoint import Checkpoints
-from physxnet_jax.training._step import TrainState
-from physxnet_jax.training._watch import Players, Validation
+from physxnet_jax.training._monitor import EarlyStopping, GanMonitor
+from physxnet_jax.training._problem import TrainState
+from physxnet_jax.training._targets import target_offsets
 from physxnet_jax.uv import garment_map_rows, make_atlas
 
 CONFIG = TrainConfig(
@@ -46,6 +46,10 @@ CONFIG = TrainConfig(
     checkpoint_every=1000,
 )
 META = {"finite": True, "worst": {"penetration_max": 0.0}}
+
+
+def raw(predictor):
+    return Inference(weights=predictor, strain_iterations=0, collisions=False)
 
 
 def sequence(name="walk", frames=20, seed=0, ok=True):
@@ -62,7 +66,7 @@ def sequence(name="walk", frames=20, seed=0, ok=True):
     return Sequence(name, "train", motion, offsets, meta)
 
 
-def test_soft_labels_lie_where_the_paper_puts_them():
+def test_soft_labels_follow_the_ranges_of_the_paper():
     for real, low, high in ((True, 0.7, 1.0), (False, 0.0, 0.3)):
         labels = np.asarray(soft_labels(jax.random.key(1), (20_000,), real=real))
         inside = (labels >= low) & (labels <= high)
@@ -71,7 +75,7 @@ def test_soft_labels_lie_where_the_paper_puts_them():
         assert ((flipped >= 0.7) if not real else (flipped <= 0.3)).all()
 
 
-def test_losses_in_closed_form():
+def test_losses_match_closed_forms():
     zeros = jnp.zeros((3, 4))
     assert float(discriminator_loss(zeros, zeros, zeros + 1, zeros)) == pytest.approx(2 * np.log(2))
     assert float(adversarial_loss(zeros)) == pytest.approx(np.log(2))
@@ -91,17 +95,17 @@ def test_losses_in_closed_form():
         assert float(hidden) == 1.0
 
 
-def test_batches_are_permutations_that_the_step_alone_decides():
+def test_batches_are_permutations_determined_by_the_step():
     seen = np.concatenate([batch_indices(40, 8, 3, step) for step in range(5)])
     assert sorted(seen) == list(range(40))
     np.testing.assert_array_equal(batch_indices(40, 8, 3, 7), batch_indices(40, 8, 3, 7))
     assert not np.array_equal(batch_indices(40, 8, 3, 0), batch_indices(40, 8, 3, 5))
 
 
-@pytest.mark.slow
-def test_twenty_steps_are_ten_and_ten_bitwise(tmp_path):
+@pytest.mark.nightly
+def test_resumed_training_is_bitwise_equal_to_uninterrupted_training(tmp_path):
     data = [sequence()]
-    config = dataclasses.replace(CONFIG, optimiser="muon")
+    config = dataclasses.replace(CONFIG, optimizer="muon")
     whole = train(config, data, tmp_path / "whole", steps=20)
     train(config, data, tmp_path / "parts", steps=10)
     parts = train(config, data, tmp_path / "parts", steps=20)
@@ -123,7 +127,8 @@ def test_twenty_steps_are_ten_and_ten_bitwise(tmp_path):
         train(config, data, tmp_path / "whole", steps=20)
 
 
-def test_a_short_run_learns_and_both_players_stay_in_their_band(tmp_path):
+@pytest.mark.release
+def test_short_run_reduces_l1_with_bounded_gan_losses(tmp_path):
     config = dataclasses.replace(CONFIG, epochs=30)
     values = []
     train(config, [sequence()], tmp_path, steps=120, report=lambda a, b, m: values.append(m))
@@ -131,7 +136,8 @@ def test_a_short_run_learns_and_both_players_stay_in_their_band(tmp_path):
     assert 0.2 < values[-1]["discriminator"] < 2.5 and values[-1]["adversarial"] < 4.0
 
 
-def test_nan_data_is_refused_by_count_and_never_enters_the_weights(tmp_path):
+@pytest.mark.release
+def test_nan_data_stops_training_after_too_many_skipped_steps(tmp_path):
     bad = sequence()
     spoiled = dataclasses.replace(bad.motion, root=bad.motion.root.at[:].set(jnp.nan))
     config = dataclasses.replace(CONFIG, max_skipped=3)
@@ -139,36 +145,37 @@ def test_nan_data_is_refused_by_count_and_never_enters_the_weights(tmp_path):
         train(config, [dataclasses.replace(bad, motion=spoiled)], tmp_path, steps=40)
 
 
-def test_cloth_that_came_off_is_left_out(tmp_path):
+def test_detached_cloth_is_excluded_from_training(tmp_path):
     with pytest.raises(FormatError, match="no usable sequence"):
         train(CONFIG, [sequence(ok=False)], tmp_path, steps=2)
     with pytest.raises(FormatError, match="build a dataset"):
         train(CONFIG, [], tmp_path, steps=2)
 
 
-def test_a_limb_out_of_its_sleeve_teaches_nothing_but_a_skirt_may_fly():
+def test_trainable_offsets_are_bounded_tightly_except_for_dresses():
     data = sequence()
     far = {t: x + np.float32([0.0, MAX_OFFSET + 0.1, 0.0]) for t, x in data.offsets.items()}
     skirt = {"dress": np.full((20, 9, 3), MAX_OFFSET, np.float32)}
     flown = dataclasses.replace(data, offsets=far | skirt, meta=data.meta | {"dress": META})
-    told = {t: teaches(flown, t) for t in flown.offsets}
+    told = {t: is_trainable(flown, t) for t in flown.offsets}
     assert told == {"top": False, "bottom": False, "dress": True}
     gone = dataclasses.replace(flown, offsets={"dress": 6 * skirt["dress"]})
-    assert not teaches(gone, "dress")
-    assert all(teaches(data, t) for t in data.offsets), "near ones do"
+    assert not is_trainable(gone, "dress")
+    assert all(is_trainable(data, t) for t in data.offsets), "near ones do"
 
 
-def test_nothing_to_learn_from_and_mixed_rates_are_refused(body, rest):
+def test_empty_datasets_and_mixed_frame_rates_are_refused(body, rest):
     usual = sequence()
     slow = dataclasses.replace(usual, motion=dataclasses.replace(usual.motion, fps=15.0))
     garments = {"bottom": template("bottom")}
     for wrong, says in (((), "no sequence"), ((usual, slow), "different frame rates")):
         with pytest.raises(FormatError, match=says):
-            load_frames(iter(wrong), garments, body, rest, Inputs())
-    assert len(load_frames(iter([usual]), garments, body, rest, Inputs())) == 20
+            load_frames(iter(wrong), garments, body, rest, window=5, local=True)
+    assert len(load_frames(iter([usual]), garments, body, rest, window=5, local=True)) == 20
 
 
-def test_the_paper_family_trains_as_well(tmp_path):
+@pytest.mark.release
+def test_paper_family_trains(tmp_path):
     config = dataclasses.replace(
         CONFIG, model=dataclasses.replace(CONFIG.model, inputs=PAPER), adversarial=False
     )
@@ -177,13 +184,14 @@ def test_the_paper_family_trains_as_well(tmp_path):
     assert values[-1]["l1"] < values[0]["l1"]
 
 
-def test_errors_at_vertices_are_learned_as_they_are_read(tmp_path):
+@pytest.mark.release
+def test_vertex_loss_reduces_the_vertex_error(tmp_path):
     model = dataclasses.replace(CONFIG.model, templates=("bottom",))
     config = dataclasses.replace(CONFIG, model=model, adversarial=False, vertex_share=1.0)
     data = sequence()
     predictor = train(dataclasses.replace(config, epochs=20), [data], tmp_path, steps=80)
     skinned = skinning()(data.motion, "bottom").positions
-    moved = network(predictor)(data.motion, "bottom").positions - skinned
+    moved = network(raw(predictor))(data.motion, "bottom").positions - skinned
     wanted = data.offsets["bottom"]
     left = np.linalg.norm(moved - wanted, axis=2).mean()
     assert left < 0.6 * np.linalg.norm(wanted, axis=2).mean()
@@ -193,7 +201,7 @@ def test_errors_at_vertices_are_learned_as_they_are_read(tmp_path):
         dataclasses.replace(config, model=dataclasses.replace(model, inputs=PAPER))
 
 
-def test_errors_of_larger_parts_of_a_map_in_closed_form():
+def test_pyramid_loss_matches_closed_forms():
     rows, columns = np.indices((8, 8))
     checks = jnp.asarray(np.where((rows + columns) % 2, 1.0, -1.0), jnp.float32)
     checks = jnp.broadcast_to(checks[None, :, :, None], (2, 8, 8, 3))
@@ -213,7 +221,7 @@ def test_errors_of_larger_parts_of_a_map_in_closed_form():
     assert np.isfinite(slope).all() and not np.asarray(slope)[np.asarray(mask[..., 0]) == 0].any()
 
 
-def test_differences_along_edges_know_nothing_of_what_all_vertices_share():
+def test_edge_loss_is_invariant_to_a_common_shift():
     edges = jnp.asarray([[0, 1], [1, 2]])
     target, weight = jnp.zeros((2, 3, 3)), jnp.asarray([1.0, 0.0])
     shifted = target + 2.0
@@ -229,14 +237,17 @@ def test_differences_along_edges_know_nothing_of_what_all_vertices_share():
             assert float(value) == pytest.approx((1.0 - share) * folded + share * differences)
 
 
-def test_losses_along_edges_and_of_larger_parts_teach(tmp_path):
+@pytest.mark.release
+def test_edge_and_pyramid_losses_reduce_the_error(tmp_path):
     model = dataclasses.replace(CONFIG.model, templates=("bottom",))
     config = dataclasses.replace(CONFIG, model=model, adversarial=False, epochs=20)
-    config = dataclasses.replace(config, vertex_share=0.7, edge_share=0.5, scales=3)
+    config = dataclasses.replace(config, vertex_share=0.7, edge_share=0.5, pyramid_levels=3)
     data = sequence()
     predictor = train(config, [data], tmp_path, steps=80)
     skinned = skinning()(data.motion, "bottom").positions
-    left = network(predictor)(data.motion, "bottom").positions - skinned - data.offsets["bottom"]
+    left = (
+        network(raw(predictor))(data.motion, "bottom").positions - skinned - data.offsets["bottom"]
+    )
     there = np.linalg.norm(data.offsets["bottom"], axis=2).mean()
     assert np.linalg.norm(left, axis=2).mean() < 0.8 * there
 
@@ -246,24 +257,24 @@ def test_losses_along_edges_and_of_larger_parts_teach(tmp_path):
     [
         ({"vertex_share": 0.5, "edge_share": 1.5}, "0 to 1"),
         ({"edge_share": 0.5}, "share of vertex_share"),
-        ({"scales": 0}, "at least 1"),
-        ({"scales": 7}, "halve that often"),
-        ({"scales": 2, "squared": True}, "choose one"),
+        ({"pyramid_levels": 0}, "at least 1"),
+        ({"pyramid_levels": 7}, "halve that often"),
+        ({"pyramid_levels": 2, "loss": "l2"}, "choose one"),
         ({"epochs": 0}, "epochs is 0"),
         ({"patience": 0}, "patience is 0"),
         ({"batch": 0}, "batch is 0"),
         ({"checkpoint_every": -1}, "checkpoint_every is -1"),
         ({"learning_rate": float("nan")}, "learning_rate is nan"),
-        ({"momentum": 1.0}, "momentum is 1.0"),
+        ({"b1": 1.0}, "b1 is 1.0"),
     ],
 )
-def test_runs_that_can_not_be_are_refused(changes, says):
+def test_invalid_training_settings_are_refused(changes, says):
     with pytest.raises(ValueError, match=says):
         dataclasses.replace(CONFIG, **changes)
 
 
-@pytest.mark.slow
-def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):
+@pytest.mark.nightly
+def test_best_validation_checkpoint_is_kept_and_training_stops_early(tmp_path):
     config = dataclasses.replace(CONFIG, validation=("b",), validate_every=4, epochs=40, patience=2)
     data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
     # A far too high rate makes it worse sooner or later.
@@ -285,12 +296,17 @@ def test_the_best_on_what_is_not_trained_on_is_the_result(tmp_path):
     assert list((tmp_path / "events").iterdir()), "TensorBoard can show it"
 
 
-@pytest.mark.slow
-def test_mirrored_actions_are_learned_from_too(tmp_path):
+@pytest.mark.nightly
+def test_mirror_augmentation_doubles_the_training_data(tmp_path):
     config = dataclasses.replace(
-        CONFIG, mirror=True, validation=("b",), adversarial=False, validate_every=100, epochs=1
+        CONFIG,
+        mirror_augmentation=True,
+        validation=("b",),
+        adversarial=False,
+        validate_every=100,
+        epochs=1,
     )
-    config = dataclasses.replace(config, squared=True)
+    config = dataclasses.replace(config, loss="l2")
     data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
     seen = []
     train(config, data, tmp_path, report=lambda done, total, _: seen.append((done, total)))
@@ -302,28 +318,29 @@ def test_mirrored_actions_are_learned_from_too(tmp_path):
     assert losses and all(0.0 < x < 1.0 for x in losses)
 
 
-def test_lines_of_steps_that_will_be_done_again_do_not_count(tmp_path):
+def test_early_stopping_ignores_metrics_after_the_checkpoint(tmp_path):
     lines = [{"step": s, "validation_mm": v} for s, v in ((4, 3.0), (8, 2.0), (12, 1.0))]
     (tmp_path / "metrics.jsonl").write_text(
         "\n".join(json.dumps(x) for x in lines) + '\n{"step": 16, "vali'
     )
     assert read_metrics(tmp_path) == lines
-    watch = Validation(lines, 8, 2)
+    watch = EarlyStopping(lines, 8, 2)
     assert watch.best == 2.0 and not watch.exhausted
     assert [watch.update(2.5), watch.update(2.1)] == [False, False] and watch.exhausted
     assert watch.update(1.9) and not watch.exhausted
 
 
-def test_what_was_done_again_counts_once_and_nothing_that_is_no_number_is_best():
+def test_early_stopping_counts_repeated_steps_once_and_ignores_nan():
     told = ((4, 3.0), (8, 2.0), (12, 2.5), (8, 2.0), (12, 2.5))
     lines = [{"step": s, "validation_mm": v} for s, v in told]
-    assert not Validation(lines, 12, 2).exhausted, "one without a better one, told twice"
-    watch = Validation([], 0, 3)
+    assert not EarlyStopping(lines, 12, 2).exhausted, "one without a better one, told twice"
+    watch = EarlyStopping([], 0, 3)
     assert watch.update(5.0) and not watch.update(float("nan"))
     assert watch.best == 5.0 and watch.update(4.0)
 
 
-def test_a_run_that_is_stopped_on_the_way_ends_as_the_whole_one(tmp_path):
+@pytest.mark.release
+def test_interrupted_run_has_the_validation_of_an_uninterrupted_one(tmp_path):
     model = dataclasses.replace(CONFIG.model, templates=("bottom",))
     config = dataclasses.replace(
         CONFIG, model=model, validation=("b",), validate_every=4, epochs=2, adversarial=False
@@ -346,8 +363,8 @@ def test_a_run_that_is_stopped_on_the_way_ends_as_the_whole_one(tmp_path):
         train(config, other, tmp_path / "parts")
 
 
-def test_states_of_steps_to_be_done_again_are_forgotten(tmp_path):
-    state = TrainState(*(jnp.zeros(()) for _ in dataclasses.fields(TrainState)))
+def test_checkpoints_after_the_resumed_step_are_deleted(tmp_path):
+    state = TrainState(**{f.name: jnp.zeros(()) for f in dataclasses.fields(TrainState)})
     at = lambda n: dataclasses.replace(state, step=jnp.int32(n))  # noqa: E731
     kept = Checkpoints(tmp_path / "best", keep=1)
     kept.save(at(8), {})
@@ -364,14 +381,14 @@ def test_states_of_steps_to_be_done_again_are_forgotten(tmp_path):
     kept.close()
 
 
-def test_a_discriminator_that_wins_or_guesses_raises_the_alarm():
+def test_gan_alarm_is_raised_by_extreme_discriminator_accuracy():
     for accuracy, alarm in ((1.0, 1.0), (0.75, 0.0), (0.5, 1.0)):
-        players = Players()
+        players = GanMonitor()
         for _ in range(100):
             seen = players.update({"discriminator_accuracy": accuracy})
         assert seen["gan_alarm"] == alarm
         assert seen["discriminator_accuracy_mean"] == pytest.approx(accuracy)
-    assert Players().update({"l1": 1.0}) == {}
+    assert GanMonitor().update({"l1": 1.0}) == {}
 
 
 @pytest.mark.parametrize(
@@ -384,15 +401,16 @@ def test_a_discriminator_that_wins_or_guesses_raises_the_alarm():
         ("adversarial", math.nan, 1.0),
     ],
 )
-def test_either_players_loss_raises_the_alarm_whatever_the_accuracy(loss, value, alarm):
-    players = Players()
+def test_gan_alarm_is_raised_by_either_loss_at_any_accuracy(loss, value, alarm):
+    players = GanMonitor()
     for _ in range(100):
         usual = {"discriminator_accuracy": 0.75, "discriminator": 1.2, "adversarial": 1.0}
         seen = players.update({**usual, loss: value})
     assert seen["gan_alarm"] == alarm
 
 
-def test_bfloat16_learns_nearly_as_fast(tmp_path):
+@pytest.mark.release
+def test_bfloat16_training_matches_float32_closely(tmp_path):
     last = {}
     for precision in ("float32", "bfloat16"):
         config = dataclasses.replace(CONFIG, precision=precision, adversarial=True)
@@ -409,7 +427,7 @@ def test_bfloat16_learns_nearly_as_fast(tmp_path):
     assert last["bfloat16"] != last["float32"], "it isn't the same arithmetic"
 
 
-def test_pictures_of_maps_show_zero_as_grey():
+def test_map_pictures_show_zero_as_grey():
     zero, one = np.zeros((4, 4, 3), np.float32), np.ones((4, 4, 3), np.float32)
     picture = map_picture(zero, one)
     assert picture.shape == (4, 12, 3)
@@ -417,7 +435,7 @@ def test_pictures_of_maps_show_zero_as_grey():
     assert (picture[:, 8:] == 0).all()
 
 
-def test_what_fills_the_last_batch_counts_for_nothing(monkeypatch):
+def test_padding_of_the_last_batch_does_not_affect_validation(monkeypatch):
     """Held-out frames of which the last is bad: the mean is that of the frames."""
     from types import SimpleNamespace
 
@@ -441,12 +459,13 @@ def test_what_fills_the_last_batch_counts_for_nothing(monkeypatch):
     monkeypatch.setattr(_loop, "take", take)
     # What is handed over only looks like frames and steps.
     validate = inspect.unwrap(_loop._validate)
-    found, _ = validate(config, SimpleNamespace(look=look), None, range(25))
+    monkeypatch.setattr(_loop, "eval_step", lambda problem, *rest: look(*rest))
+    found, _ = validate(SimpleNamespace(config=config), None, range(25))
     assert found["validation_mm"] == pytest.approx(errors[::3].mean())
 
 
-def test_the_mean_of_the_accuracy_goes_on_where_it_was():
-    whole, first = Players(), Players()
+def test_gan_monitor_resumes_its_running_means():
+    whole, first = GanMonitor(), GanMonitor()
     rng = np.random.default_rng(0)
     noted = []
     for step in range(60):
@@ -456,17 +475,17 @@ def test_the_mean_of_the_accuracy_goes_on_where_it_was():
             noted.append({"step": float(step), **first.update(seen)})
             # What was written after the last checkpoint is done again.
             late = {"step": 99.0, "discriminator_accuracy_mean": 0.0, "adversarial_mean": 0.0}
-            rest = Players([*noted, late], step)
+            rest = GanMonitor([*noted, late], step)
         else:
             got = rest.update(seen)
     assert got == want
 
 
-def test_targets_of_the_papers_family_begin_on_the_skin(body, rest):
+def test_paper_family_targets_start_at_the_skin(body, rest):
     """At rest, without an offset: from each texel to the cloth that its ray meets."""
     atlas, g = make_atlas(32), template("bottom")
     rows = garment_map_rows(atlas, body, rest, g)
-    surface = make_surface(atlas, body, rest, {"bottom": rows.valid})
+    surface = make_texel_points(atlas, body, rest, {"bottom": rows.valid})
     joints = len(body.parents)
     turns, shifts = jnp.tile(jnp.eye(3), (1, joints, 1, 1)), jnp.zeros((1, joints, 3))
     worn = g.rest_vertices(rest)
@@ -481,7 +500,8 @@ def test_targets_of_the_papers_family_begin_on_the_skin(body, rest):
         np.testing.assert_allclose(local, np.tile([0.0, 1e-4 * up, 0.0], (len(seen), 1)), atol=1e-6)
 
 
-def test_the_loss_is_the_sum_that_the_weight_says_and_errors_are_millimetres(tmp_path):
+@pytest.mark.release
+def test_loss_is_the_weighted_sum_and_errors_are_in_millimetres(tmp_path):
     data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
     config = dataclasses.replace(CONFIG, l1_weight=10.0, validation=("b",), validate_every=1)
     train(config, data, tmp_path, steps=1)
@@ -495,7 +515,7 @@ def test_the_loss_is_the_sum_that_the_weight_says_and_errors_are_millimetres(tmp
     assert 0.3 * wanted < told["l1_mm_bottom"] < 5.0 * wanted
 
 
-def test_what_came_off_is_no_error_of_nothing(tmp_path):
+def test_validation_without_usable_cloth_is_refused(tmp_path):
     """On what is held out, as on what is learned from."""
     data = [sequence(seed=0), dataclasses.replace(sequence(seed=1, ok=False), name="b")]
     config = dataclasses.replace(CONFIG, validation=("b",))
@@ -503,12 +523,13 @@ def test_what_came_off_is_no_error_of_nothing(tmp_path):
         train(config, data, tmp_path, steps=1)
 
 
-def test_another_seed_sees_frames_in_another_order():
+def test_seed_determines_the_frame_order():
     a, b = (np.concatenate([batch_indices(40, 8, s, k) for k in range(5)]) for s in (0, 1))
     assert sorted(a) == sorted(b) and not np.array_equal(a, b)
 
 
-def test_the_weights_that_measured_best_are_handed_back(tmp_path, monkeypatch):
+@pytest.mark.release
+def test_train_returns_the_weights_of_the_best_validation(tmp_path, monkeypatch):
     """Best after two of four steps: what comes back is the run of two."""
     data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]
     config = dataclasses.replace(CONFIG, adversarial=False, validation=("b",), validate_every=1)

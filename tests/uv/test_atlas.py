@@ -18,7 +18,7 @@ from physxnet_jax.uv import (
 
 
 @pytest.mark.parametrize("size", [64, 128, (96, 160)])
-def test_the_atlas_fills_the_square(size):
+def test_atlas_fills_the_unit_square_without_flipped_faces(size):
     atlas = make_atlas(size)
     assert atlas.used > 0.7 and atlas.used_before < 0.4
     texels = np.asarray(atlas.texels)
@@ -29,7 +29,7 @@ def test_the_atlas_fills_the_square(size):
     assert uv.min() >= 0 and uv.max() <= 1
 
 
-def test_the_atlas_drops_face_hands_and_feet(body):
+def test_atlas_excludes_face_hands_and_feet(body):
     atlas = make_atlas(64)
     used = np.unique(np.asarray(atlas.faces))
     points = np.asarray(body.rest_mesh().vertices)[used]
@@ -40,7 +40,7 @@ def test_the_atlas_drops_face_hands_and_feet(body):
     assert points[:, 1].max() < 0.6
 
 
-def test_texels_lie_on_the_body_and_weights_are_row_stochastic(body):
+def test_texel_points_lie_on_the_body_with_row_stochastic_weights(body):
     atlas = make_atlas(64)
     weights = np.asarray(atlas.to_body.weights)
     assert weights.min() >= 0
@@ -85,14 +85,14 @@ def test_every_texel_of_a_triangulated_square_is_covered_once(seed, size):
     np.testing.assert_allclose(at, centre, atol=1e-4)
 
 
-def test_triangles_without_area_cover_nothing():
+def test_degenerate_triangles_cover_no_texels():
     uv = np.array([[0, 0], [1, 1], [0.5, 0.5], [0, 1]])
     texels, _, weights = rasterise(uv, np.array([[0, 1, 2], [0, 0, 0]]), 16, 16)
     assert len(texels) == 0 and np.isfinite(weights).all()
     assert len(rasterise(uv, np.array([[0, 1, 3], [0, 1, 2]]), 16, 16)[0]) > 100
 
 
-def test_velocity_and_acceleration_of_a_parabola():
+def test_velocity_and_acceleration_maps_of_a_parabola_are_exact():
     t = np.arange(8) / 30.0
     path = jnp.asarray((0.5 * 3.0 * t**2)[:, None, None] * np.ones((1, 2, 3)), jnp.float32)
     velocity, acceleration = velocity_maps(path, 30.0), acceleration_maps(path, 30.0)
@@ -102,18 +102,19 @@ def test_velocity_and_acceleration_of_a_parabola():
     np.testing.assert_allclose(np.asarray(velocity[1:, 0, 0]), expected, rtol=1e-3)
 
 
-def test_transference_carries_constants_and_batches():
+def test_transference_preserves_constants_and_batches():
     t = Transference(
         jnp.array([[0, 1, 2], [2, 2, 2]]),
         jnp.array([[0.2, 0.3, 0.5], [1, 0, 0.0]]),
         jnp.ones(2, bool),
+        3,
     )
     ones = jnp.ones((4, 3, 2))
     np.testing.assert_allclose(np.asarray(body_map(t, jnp.ones((4, 3, 3)))), 1.0, atol=1e-6)
     assert (t @ ones).shape == (4, 2, 2)
 
 
-def test_the_dress_body_joins_the_legs_and_keeps_the_rest(body, rest):
+def test_dress_body_joins_the_legs_and_changes_nothing_else(body, rest):
     joined = dress_body(body, np.asarray(rest))
     plain = np.asarray(rest[:NUM_BODY_VERTICES])
     assert joined.shape == plain.shape and np.isfinite(joined).all()
@@ -125,7 +126,7 @@ def test_the_dress_body_joins_the_legs_and_keeps_the_rest(body, rest):
     assert gap < 0.03 < np.abs(plain[knee][:, 0]).min() + 0.03
 
 
-def test_the_inner_halves_of_the_legs_lie_beneath_the_hull(body, rest):
+def test_inner_leg_halves_lie_beneath_the_hull(body, rest):
     """A ray from outside meets the outer half first: the inner one is a tenth deeper."""
     joined = dress_body(body, np.asarray(rest))
     ring = joined[np.abs(np.asarray(rest)[: len(joined), 1] + 0.35) < 0.03]

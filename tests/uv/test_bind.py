@@ -8,7 +8,7 @@ import pytest
 
 from physxnet_jax.garment import TEMPLATES, template
 from physxnet_jax.geometry import closest_points
-from physxnet_jax.uv import bind, dress_body, garment_map, garment_map_rows, make_atlas
+from physxnet_jax.uv import bind, cloth_offsets, dress_body, garment_map_rows, make_atlas
 from physxnet_jax.uv._bind import chart_mesh
 
 
@@ -17,10 +17,10 @@ def bound(request, body, rest):
     atlas = make_atlas(64)
     g = template(request.param)
     rows = garment_map_rows(atlas, body, rest, g)
-    return atlas, g, rows, bind(atlas, body, rest, g, rows.valid)
+    return atlas, g, rows, bind(g, atlas=atlas, body=body, rest=rest, valid=rows.valid)
 
 
-def test_most_vertices_are_hit_and_fallbacks_are_counted(bound):
+def test_most_rays_hit_and_fallbacks_are_counted(bound):
     _, g, rows, binding = bound
     assert binding.hit_rate > 0.95
     assert binding.fallbacks == round((1 - binding.hit_rate) * g.num_vertices)
@@ -35,7 +35,7 @@ def test_sampling_weights_sum_to_one_and_use_valid_texels_only(bound):
     assert (valid | (weight == 0)).all()
 
 
-def test_nothing_bleeds_over_an_edge(bound, body):
+def test_sampling_does_not_bleed_across_chart_borders(bound, body):
     """A map that is 1 on the left half of the body stays 1 at every left vertex."""
     atlas, g, _, binding = bound
     side = (atlas.to_body @ body.rest_mesh().vertices)[:, :1]
@@ -46,7 +46,7 @@ def test_nothing_bleeds_over_an_edge(bound, body):
     assert np.mean(np.sign(x[clear]) == np.sign(sampled[clear])) > 0.995
 
 
-def test_a_map_of_the_garments_own_offsets_gives_the_garment_back(bound, body):
+def test_offset_map_of_a_garment_reproduces_the_garment(bound, body):
     """Round trip of the paper: texel -> cloth -> texel -> vertex, at rest."""
     atlas, g, rows, binding = bound
     vertices = body.rest_mesh().vertices
@@ -54,20 +54,22 @@ def test_a_map_of_the_garments_own_offsets_gives_the_garment_back(bound, body):
         # Its map starts from the body with joined legs.
         joined = dress_body(body, np.asarray(body.rest_vertices(body.default_shape())))
         vertices = jnp.asarray(joined.astype(np.float32))
-    offsets = garment_map(rows, g.mesh.vertices, atlas.to_body @ vertices)
+    offsets = cloth_offsets(rows, g.mesh.vertices, atlas.to_body @ vertices)
     again = (binding.to_body @ vertices) + binding.sample(offsets)
     error = np.linalg.norm(np.asarray(again) - np.asarray(g.mesh.vertices), axis=1)
     assert np.median(error) < 0.005
 
 
-def test_a_garment_of_fewer_vertices_shares_the_programs_and_binds_alike(bound, body, rest):
+def test_smaller_garment_reuses_programs_and_binds_alike(bound, body, rest):
     atlas, g, rows, binding = bound
     before = closest_points._cache_size()
     # A face's last vertex goes; the others stay where they are.
     faces = np.asarray(g.mesh.faces)
     kept = faces[(faces < g.num_vertices - 1).all(axis=1)]
     mesh = g.mesh.replace(vertices=g.mesh.vertices[:-1], faces=jnp.asarray(kept))
-    less = bind(atlas, body, rest, dataclasses.replace(g, mesh=mesh), rows.valid)
+    less = bind(
+        dataclasses.replace(g, mesh=mesh), atlas=atlas, body=body, rest=rest, valid=rows.valid
+    )
     assert closest_points._cache_size() == before
     assert len(less.texel) == g.num_vertices - 1
     # Normals, and so rays, differ beside what is gone alone.
@@ -75,27 +77,29 @@ def test_a_garment_of_fewer_vertices_shares_the_programs_and_binds_alike(bound, 
     assert same.mean() > 0.99
 
 
-def test_an_upside_down_garment_falls_back_but_stays_finite(body, rest):
+def test_displaced_garment_falls_back_and_stays_finite(body, rest):
     atlas = make_atlas(32)
     g = template("bottom")
     far = g.mesh.replace(vertices=g.mesh.vertices + jnp.array([[0.0, 0.0, 0.6]]))
     rows = garment_map_rows(atlas, body, rest, g)
-    lost = bind(atlas, body, rest, dataclasses.replace(g, mesh=far), rows.valid)
+    lost = bind(
+        dataclasses.replace(g, mesh=far), atlas=atlas, body=body, rest=rest, valid=rows.valid
+    )
     assert int(lost.fallbacks) > 0.5 * g.num_vertices
     assert np.isfinite(np.asarray(lost.weight)).all()
 
 
-def test_a_map_of_places_is_sampled_where_they_are(bound, body, rest):
+def test_position_map_is_sampled_without_offset(bound, body, rest):
     """The place of every texel, read at the vertices: no half texel (12 mm here) beside."""
     atlas, g, _, _ = bound
-    whole = bind(atlas, body, rest, g, jnp.ones(atlas.num_texels, bool))
+    whole = bind(g, atlas=atlas, body=body, rest=rest, valid=jnp.ones(atlas.num_texels, bool))
     skin = body.rest_mesh().vertices
     gap = np.asarray(whole.sample(atlas.to_body @ skin) - whole.to_body @ skin)
     assert np.median(np.linalg.norm(gap, axis=1)) < 2e-3
     assert np.abs(gap.mean(axis=0)).max() < 1e-3
 
 
-def test_no_ray_is_believed_that_goes_past_the_nearest_skin(bound, body, rest):
+def test_ray_hits_far_beyond_the_nearest_skin_are_rejected(bound, body, rest):
     atlas, g, _, binding = bound
     mesh = chart_mesh(atlas, body, rest, g.template)
     x = g.mesh.vertices
@@ -104,15 +108,15 @@ def test_no_ray_is_believed_that_goes_past_the_nearest_skin(bound, body, rest):
     assert (bound_at <= 2.0 * near + 0.0101).all()
 
 
-def test_texels_that_no_ray_met_are_zero(bound, body):
+def test_texels_without_a_ray_hit_are_zero(bound, body):
     atlas, g, rows, _ = bound
     points = atlas.to_body @ body.rest_mesh().vertices
-    offsets = np.asarray(garment_map(rows, g.mesh.vertices, points))
+    offsets = np.asarray(cloth_offsets(rows, g.mesh.vertices, points))
     valid = np.asarray(rows.valid)
     assert not offsets[~valid].any() and (np.abs(offsets[valid]).max(axis=1) > 0).all()
 
 
-def test_cloth_that_hangs_far_off_the_legs_is_on_the_map(bound, body, rest):
+def test_cloth_far_from_the_legs_is_on_the_map(bound, body, rest):
     """A hem stands a hand's breadth off the hull of both legs."""
     atlas, g, rows, _ = bound
     points = atlas.to_body @ chart_mesh(atlas, body, rest, g.template).vertices

@@ -16,14 +16,15 @@ from rich.console import Console
 
 from physxnet_jax.cli import main, parse
 from physxnet_jax.cli._view import view
+from physxnet_jax.dressing import Inference, Simulation
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.garment import template
-from physxnet_jax.io import DEFAULT, MIRROR, RELAX, read_obj, split_ways, write_obj
+from physxnet_jax.io import read_obj, write_obj
 from physxnet_jax.motion import procedural_clip, save_motion
 
 pytest.importorskip("viser")
 
-from physxnet_jax.viewer import Choice, Viewer, carry_out, record
+from physxnet_jax.viewer import Choice, Viewer, record, run_job
 
 _BROWSER = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "browser.py"))
 SHORT = Choice("walk", ("bottom",), method="lbs", frames=10, fps=10.0)
@@ -37,7 +38,7 @@ def viewer():
     it.close()
 
 
-def test_what_is_chosen_is_what_is_shown(viewer):
+def test_viewer_shows_the_selected_choice(viewer):
     assert viewer.shown.choice == SHORT and viewer.shown.num_frames == 10
     viewer._widgets["motion"].value = "balance"
     viewer._worn["top"].value = True
@@ -46,7 +47,7 @@ def test_what_is_chosen_is_what_is_shown(viewer):
     assert shown.choice.motion == "balance" and shown.choice.wear == ("bottom", "top")
     assert shown.choice.shape == (("weight_up", 0.5),)
     assert [m.name for m in shown.garments] == ["bottom", "top"]
-    slim = carry_out(Choice("balance", ("bottom",), method="lbs", frames=2, fps=10.0))
+    slim = run_job(Choice("balance", ("bottom",), method="lbs", frames=2, fps=10.0))
     assert np.ptp(shown.garments[0].positions[0][:, 0]) > np.ptp(
         slim.garments[0].positions[0][:, 0]
     )
@@ -56,7 +57,7 @@ def test_what_is_chosen_is_what_is_shown(viewer):
     assert viewer.wait().choice == SHORT
 
 
-def test_what_is_ticked_is_waited_for_before_anybody_asked(viewer, monkeypatch):
+def test_wait_covers_selections_not_yet_requested(viewer, monkeypatch):
     """Between a tick and the answer to it lies a moment: what was shown then is stale."""
     viewer.wait()
     late = threading.Timer(1.0, Viewer.ask, (viewer,))
@@ -68,25 +69,25 @@ def test_what_is_ticked_is_waited_for_before_anybody_asked(viewer, monkeypatch):
     assert viewer.wait().choice == SHORT
 
 
-def test_a_clip_without_clothes_is_a_body(viewer):
+def test_viewer_shows_the_body_without_garments(viewer):
     viewer._worn["bottom"].value = False
     assert viewer.wait().garments == ()
     viewer._worn["bottom"].value = True
     assert len(viewer.wait().garments) == 1
 
 
-def test_an_error_is_told_and_passes(viewer, tmp_path):
+def test_errors_are_reported_and_recovered_from(viewer, tmp_path):
     viewer.add_file("../../broken.bvh", b"HELLO")
     with pytest.raises(PhysXNetError, match="HIERARCHY"):
         viewer.wait()
     assert "HIERARCHY" in viewer._status.content and ".." not in str(viewer._files["broken.bvh"])
     viewer._widgets["motion"].value = "walk"
     assert viewer.wait().choice == SHORT
-    with pytest.raises(FormatError, match="not a motion"):
+    with pytest.raises(FormatError, match="neither a motion"):
         viewer.add_file("a.exe", b"MZ")
 
 
-def test_garments_are_put_on_in_the_order_in_which_they_were_named(tmp_path, monkeypatch):
+def test_garments_keep_the_order_in_which_they_were_named(tmp_path, monkeypatch):
     """Of two of one kind the first named is beneath, as `dress` has it; both of one name show."""
     there, top = [], template("top").mesh
     for folder in ("a", "b"):
@@ -99,7 +100,7 @@ def test_garments_are_put_on_in_the_order_in_which_they_were_named(tmp_path, mon
         raise PhysXNetError("nothing")
 
     # What is chosen is asked here, not what comes of it.
-    monkeypatch.setattr("physxnet_jax.viewer._web.carry_out", nothing)
+    monkeypatch.setattr("physxnet_jax.viewer._web.run_job", nothing)
     it = Viewer(dataclasses.replace(SHORT, wear=named), port=8131)
     try:
         assert it.chosen().wear == named and len(it._worn) == 5
@@ -111,7 +112,7 @@ def test_garments_are_put_on_in_the_order_in_which_they_were_named(tmp_path, mon
         it.close()
 
 
-def test_what_a_file_says_is_text_on_the_page(viewer):
+def test_file_contents_in_errors_are_escaped(viewer):
     viewer.add_file("a.bvh", b"<iframe srcdoc='x'>*b*")
     with pytest.raises(PhysXNetError):
         viewer.wait()
@@ -121,14 +122,14 @@ def test_what_a_file_says_is_text_on_the_page(viewer):
     viewer.wait()
 
 
-def test_what_cannot_be_carried_out_is_refused_before_anything_listens():
+def test_invalid_choices_are_refused_before_the_server_starts():
     with pytest.raises(PhysXNetError, match="at least one"):
         Viewer(dataclasses.replace(SHORT, frames=0))
     with pytest.raises(PhysXNetError, match="No weights"):
-        Viewer(dataclasses.replace(SHORT, method="network", weights="none"))
+        Viewer(dataclasses.replace(SHORT, method="network", inference=Inference(weights="none")))
 
 
-def test_on_another_shape_clothes_and_body_stand_on_one_floor(tmp_path):
+def test_garments_and_body_share_the_floor_for_other_shapes(tmp_path):
     """The clip is cut before its lowest point: clothes and body are lowered alike."""
     still = procedural_clip("balance", fps=30.0)
     root = np.asarray(still.root).copy()
@@ -136,14 +137,15 @@ def test_on_another_shape_clothes_and_body_stand_on_one_floor(tmp_path):
     save_motion(tmp_path / "hop.npz", dataclasses.replace(still, root=jnp.asarray(root)))
     path = str(tmp_path / "hop.npz")
     choice = Choice(path, ("bottom",), method="lbs", frames=4, shape=(("height_up", 0.8),))
-    shown = carry_out(choice)
+    shown = run_job(choice)
     body, trousers = (m.positions for m in shown.meshes())
     assert abs(body[..., 1].min()) < 0.01
     # The hem hangs at the ankles, not a hop above or below them.
     assert 0.0 < trousers[..., 1].min() - body[..., 1].min() < 0.15
 
 
-def test_what_is_taken_away_is_what_is_shown(viewer, tmp_path):
+@pytest.mark.release
+def test_viewer_export_matches_the_shown_clip(viewer, tmp_path):
     shown = viewer.wait()
     name, content = viewer.export(".npz")
     assert name == "walk.npz"
@@ -163,7 +165,7 @@ def test_what_is_taken_away_is_what_is_shown(viewer, tmp_path):
     viewer.wait()
 
 
-def test_the_skinned_body_on_the_page_is_the_body(viewer, body):
+def test_page_skinning_matches_the_body(viewer, body):
     """Bones sent to the page move vertices as skinning does, but for the weights beyond four."""
     shown = viewer.wait()
     vertices = shown.meshes()[0].positions[5]
@@ -177,28 +179,32 @@ def test_the_skinned_body_on_the_page_is_the_body(viewer, body):
     assert np.linalg.norm(seen - vertices, axis=1).max() < 0.01
 
 
-def test_beside_the_simulation_distances_are_told():
-    shown = carry_out(Choice("balance", ("bottom",), method="lbs", frames=3, compare=True))
+def test_comparison_reports_distances_to_the_simulation():
+    shown = run_job(Choice("balance", ("bottom",), method="lbs", frames=3, compare=True))
     d = shown.distances["bottom"]
     gap = shown.garments[0].positions - shown.reference[0].positions
     np.testing.assert_allclose(d, np.linalg.norm(gap, axis=2))
-    assert 0 < d.mean() < 0.05 and "mm RMSE from the simulation" in shown.told
+    assert 0 < d.mean() < 0.05 and "mm RMSE from the simulation" in shown.summary
 
 
-def test_maps_show_the_motion():
-    shown = carry_out(Choice("punch", ("top",), weights="nano", frames=20))
+@pytest.mark.release
+def test_maps_display_velocity_and_acceleration():
+    shown = run_job(Choice("punch", ("top",), inference=Inference(weights="nano"), frames=20))
     maps = shown.maps(10, ("top",))
     assert {"velocity", "acceleration", "top"} == set(maps)
-    still = carry_out(Choice("balance", (), weights="nano", frames=1)).maps(0, ("top",))
+    still = run_job(Choice("balance", (), inference=Inference(weights="nano"), frames=1)).maps(
+        0, ("top",)
+    )
     grey = [np.abs(m["velocity"].astype(int) - 127).max() for m in (maps, still)]
     covered = (still["velocity"] != 255).any(axis=2)
     assert grey[0] > 100 and np.abs(still["velocity"][covered].astype(int) - 127).max() <= 1
     assert maps["top"].shape == (64, 64, 3)
 
 
-def test_live_clothes_are_those_of_the_clip_wherever_it_is_entered(viewer):
-    choice = Choice("walk", ("bottom",), weights="nano", frames=12, live=True)
-    shown = carry_out(choice)
+@pytest.mark.release
+def test_live_cloth_matches_the_clip_from_any_frame(viewer):
+    choice = Choice("walk", ("bottom",), inference=Inference(weights="nano"), frames=12, live=True)
+    shown = run_job(choice)
     assert shown.live is not None and np.isnan(shown.live.milliseconds)
     clip = shown.garments[0].positions
     for frame in (0, 1, 2, 9, 10, 4, 4):
@@ -207,19 +213,21 @@ def test_live_clothes_are_those_of_the_clip_wherever_it_is_entered(viewer):
     assert np.abs(live - clip[9]).max() > 0.01, "the clip moves"
     assert 0 < shown.live.milliseconds < np.inf
     # What only the network can answer isn't asked of skinning.
-    assert carry_out(dataclasses.replace(SHORT, live=True)).live is None
+    assert run_job(dataclasses.replace(SHORT, live=True)).live is None
 
 
-def test_ticks_are_words_behind_the_networks_name(viewer):
+def test_checkboxes_switch_post_processing(viewer):
     w = viewer._widgets
-    assert viewer.chosen().weights == SHORT.weights == DEFAULT
-    w[MIRROR].value, w[RELAX].value = True, False
-    assert viewer.chosen().weights == f"{split_ways(DEFAULT)[0]}{MIRROR}"
-    w[MIRROR].value, w[RELAX].value = False, True
+    assert viewer.chosen().inference == SHORT.inference == Inference()
+    w["tta"].value, w["strain"].value = True, False
+    chosen = viewer.chosen().inference
+    assert chosen.tta and chosen.strain_iterations == 0
+    w["tta"].value, w["strain"].value = False, True
     assert viewer.wait().choice == SHORT
 
 
-def test_live_clothes_are_what_the_page_shows_with_their_time(viewer):
+@pytest.mark.release
+def test_viewer_shows_live_cloth_and_its_time(viewer):
     viewer._playing.value = False
     viewer._widgets["weights"].value, viewer._widgets["method"].value = "nano", "network"
     viewer._widgets["live"].value = True
@@ -234,12 +242,12 @@ def test_live_clothes_are_what_the_page_shows_with_their_time(viewer):
     assert "nan" not in viewer._pace.content
     viewer._widgets["live"].value = False
     viewer._widgets["method"].value = "lbs"
-    viewer._widgets["weights"].value = split_ways(SHORT.weights)[0]
+    viewer._widgets["weights"].value = SHORT.inference.weights
     assert viewer.wait().choice == SHORT and not viewer._pace.visible
     viewer._playing.value = True
 
 
-def test_a_page_is_written_whole(tmp_path):
+def test_recorded_page_is_a_single_complete_file(tmp_path):
     path = tmp_path / "walk.html"
     record(path, SHORT)
     text = path.read_text(encoding="utf-8")
@@ -247,7 +255,7 @@ def test_a_page_is_written_whole(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["walk.html"]
 
 
-def test_the_command_serves_until_it_is_ended_and_writes_pages(tmp_path, capsys, monkeypatch):
+def test_view_command_writes_pages_and_serves_until_stopped(tmp_path, capsys, monkeypatch):
     path = tmp_path / "walk.html"
     words = ["view", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "3", "--fps", "10"]
     assert main([*words, "--html", str(path)]) == 0
@@ -267,11 +275,11 @@ def test_the_command_serves_until_it_is_ended_and_writes_pages(tmp_path, capsys,
     assert len(opened) == 1 and "ssh -L 8300:localhost:8300" in console.file.getvalue()
 
 
-def test_the_command_chooses_all_that_the_page_does(tmp_path, monkeypatch):
+def test_view_command_supports_all_page_options(tmp_path, monkeypatch):
     chosen = []
     monkeypatch.setattr("physxnet_jax.cli._view.Viewer", lambda c, **_: chosen.append(c) or 1 / 0)
     words = ["view", "punch", "--shape", "weight_up=0.5", "--wind", "0", "1", "4"]
-    words += ["--fabric", "silk", "--accuracy", "draft", "--self-contact", "--no-push-out"]
+    words += ["--fabric", "silk", "--accuracy", "draft", "--self-contact", "--no-collisions"]
     words += ["--live"]
     with pytest.raises(ZeroDivisionError):
         view(parse(words), Console(file=io.StringIO()))
@@ -279,11 +287,9 @@ def test_the_command_chooses_all_that_the_page_does(tmp_path, monkeypatch):
         Choice(
             motion="punch",
             shape=(("weight_up", 0.5),),
-            wind=(0.0, 1.0, 4.0),
+            simulation=Simulation(accuracy="draft", wind=(0.0, 1.0, 4.0), self_contact=True),
             fabric="silk",
-            accuracy="draft",
-            self_contact=True,
-            push_out=False,
+            inference=Inference(collisions=False),
             live=True,
         )
     ]
@@ -293,7 +299,8 @@ def test_the_command_chooses_all_that_the_page_does(tmp_path, monkeypatch):
     assert main(["view", "--html", "/proc/a.html"]) == 2
     assert main(["view", "--shape", "weight_up"]) == 2
     assert main(["view", "--shape", "girth=1", "--html", str(tmp_path / "a.html")]) == 2
-    assert main(["view", "--fabric", "tin", "--html", str(tmp_path / "a.html")]) == 2
+    with pytest.raises(SystemExit):
+        main(["view", "--fabric", "tin", "--html", str(tmp_path / "a.html")])
 
 
 @pytest.fixture
@@ -305,7 +312,7 @@ def page(viewer, tmp_path):
 
 @pytest.mark.browser
 @pytest.mark.skipif(_BROWSER["BROWSER"] is None, reason="no Chromium installed")
-def test_a_garment_ticked_in_a_browser_appears(viewer, page, tmp_path):
+def test_garment_selected_in_a_browser_appears(viewer, page, tmp_path):
     viewer.wait()
     viewer._playing.value = False
     page.until("document.body.innerText.includes('bottom')")

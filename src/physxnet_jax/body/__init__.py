@@ -1,10 +1,10 @@
-"""The human body: shape, pose and skin. Knows nothing of motion files."""
+"""The human body: shape, pose and skin, independent of motion files."""
 
 from ._align import (
-    align_bones as align_bones,
     align_global as align_global,
     bone_directions as bone_directions,
     smallest_rotation as smallest_rotation,
+    t_pose as t_pose,
 )
 from ._body import (
     NUM_BODY_VERTICES as NUM_BODY_VERTICES,
@@ -16,6 +16,7 @@ from ._kinematics import (
     blend_rotations as blend_rotations,
     forward_kinematics as forward_kinematics,
     linear_blend_skinning as linear_blend_skinning,
+    skin_points as skin_points,
 )
 from ._register import (
     Registration as Registration,
@@ -27,7 +28,6 @@ from ._segments import (
     FOREARMS as FOREARMS,
     HANDS as HANDS,
     THIGHS as THIGHS,
-    TRUNK as TRUNK,
     UPPER_ARMS as UPPER_ARMS,
     body_segments as body_segments,
 )

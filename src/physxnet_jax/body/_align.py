@@ -1,7 +1,8 @@
-"""Poses that put bones along given directions, by the smallest rotations."""
+"""Poses that align bones with given directions by the smallest rotations."""
 
 from collections.abc import Mapping
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.spatial.transform import Rotation
@@ -17,7 +18,7 @@ def smallest_rotation(a: Float[np.ndarray, "3"], b: Float[np.ndarray, "3"]) -> R
     if sine < 1e-9:
         if cosine > 0:
             return Rotation.identity()
-        # Opposite directions: any perpendicular axis is as good as another.
+        # Opposite directions: any perpendicular axis works.
         side = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
         return Rotation.from_rotvec(np.pi * side / np.linalg.norm(side))
     return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine))
@@ -38,9 +39,9 @@ def align_global(
     targets: Mapping[str, Float[np.ndarray, "3"]],
     shape: Float[Array, " shapes"] | None = None,
 ) -> list[Rotation]:
-    """World rotations, relative to rest, that turn named bones to given directions.
+    """World rotations, relative to rest, that align named bones with given directions.
 
-    A bone without a target keeps its place relative to its parent.
+    A bone without a target keeps its orientation relative to its parent.
     """
     directions = bone_directions(body, shape)
     world: list[Rotation] = []
@@ -60,8 +61,21 @@ def align_bones(
     targets: Mapping[str, Float[np.ndarray, "3"]],
     shape: Float[Array, " shapes"] | None = None,
 ) -> Float[np.ndarray, "joints 4"]:
-    """Local quaternions (wxyz) of `align_global`."""
+    """Local quaternions (wxyz) for the rotations of `align_global`."""
     world = align_global(body, targets, shape)
     local = [r if p < 0 else world[p].inv() * r for r, p in zip(world, body.parents, strict=True)]
     quaternions = np.stack([r.as_quat(scalar_first=True) for r in local])
     return np.where(quaternions[:, :1] < 0, -quaternions, quaternions)
+
+
+def t_pose(body: Body, shape: Float[Array, " shapes"] | None = None) -> Float[Array, "joints 4"]:
+    """A T-pose: arms along the X axis, legs straight down; computed on the host.
+
+    Bones are turned by the smallest rotation, the forearm after the upper arm.
+    """
+    x, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])
+    targets = {}
+    for side, sign in (("Left", 1.0), ("Right", -1.0)):
+        targets |= {f"{side}Arm": sign * x, f"{side}ForeArm": sign * x}
+        targets |= {f"{side}UpLeg": down, f"{side}Leg": down}
+    return jnp.asarray(align_bones(body, targets, shape), jnp.float32)

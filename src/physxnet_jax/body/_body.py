@@ -31,7 +31,7 @@ class Body:
     Attributes:
         bases: Female and male rest positions [m], A-pose, shape [2, all, 3].
         deltas: Shape displacements at parameter 1 [m], shape [2, deltas, all, 3].
-        joint_rows: Eight vertices whose mean is a joint's head and tail, shape
+        joint_rows: Eight vertices each whose means are a joint's head and tail, shape
             [joints, 2, 8].
         weights: Skinning weights of all vertices, shape [all, joints].
         quads: Body quads, shape [quads, 4].
@@ -42,7 +42,7 @@ class Body:
         joint_names: Names as in the `cmu_mb` rig.
         parents: Parent of every joint, -1 for the root.
         shape_names: Names of the shape parameters: gender (0 female, 1 male), then
-            one for each delta, each meant for [0, 1].
+            one for each delta, all intended for [0, 1].
     """
 
     bases: Float[Array, "2 all 3"]
@@ -96,12 +96,12 @@ class Body:
         """Rest positions [m] of all vertices, helpers included.
 
         Raises:
-            ValueError: Another number of parameters than ``shape_names``.
+            ValueError: The number of parameters differs from ``shape_names``.
         """
         if shape.shape != (len(self.shape_names),):
             raise ValueError(
-                f"a shape of {shape.shape}; the body has {len(self.shape_names)} parameters,"
-                f" {', '.join(self.shape_names)}. Make one by body.shape(name=value)."
+                f"shape is {shape.shape}, but the body has {len(self.shape_names)} parameters,"
+                f" {', '.join(self.shape_names)}. Use body.shape(name=value)."
             )
         return _rest_vertices(self.bases, self.deltas, shape)
 
@@ -126,7 +126,7 @@ class Body:
         return TriMesh(vertices, triangulate(self.quads), self.uv, triangulate(self.uv_quads))
 
     def rest_mesh(self, shape: Float[Array, " shapes"] | None = None) -> TriMesh:
-        """The body mesh at rest (A-pose); the default shape if none is given."""
+        """The body mesh at rest (A-pose), of the default shape if none is given."""
         rest = self.rest_vertices(self.default_shape() if shape is None else shape)
         return self.mesh(rest[:NUM_BODY_VERTICES])
 
@@ -138,8 +138,8 @@ class Body:
         """Shape parameters by name.
 
         Raises:
-            PhysXNetError: A name that isn't in ``shape_names``, or a value outside
-                [-1, 2], beyond which bodies fall apart.
+            PhysXNetError: A name isn't in ``shape_names``, or a value is outside
+                [-1, 2], beyond which bodies degenerate.
 
         Example:
             >>> load_body().shape(gender=1.0, weight_up=0.5).shape
@@ -148,13 +148,13 @@ class Body:
         unknown = set(values) - set(self.shape_names)
         if unknown:
             raise PhysXNetError(
-                f"Unknown shape parameter {sorted(unknown)}; there are"
+                f"Unknown shape parameter {sorted(unknown)}; expected one of"
                 f" {', '.join(self.shape_names)}."
             )
         for name, value in values.items():
             if not -1.0 <= value <= 2.0:
                 raise PhysXNetError(
-                    f"{name}={value}: expected a number from 0 to 1, at most from -1 to 2."
+                    f"{name}={value}: expected a number from 0 to 1 (limits: -1 and 2)."
                 )
         return jnp.asarray([float(values.get(name, 0.0)) for name in self.shape_names], jnp.float32)
 
@@ -164,22 +164,8 @@ class Body:
         one[:, 0] = 1.0
         return jnp.asarray(one)
 
-    def t_pose(self, shape: Float[Array, " shapes"] | None = None) -> Float[Array, "joints 4"]:
-        """Arms along the X axis, legs straight down, on the host.
-
-        Bones are turned by the smallest rotation, the forearm after the upper arm.
-        """
-        from ._align import align_bones
-
-        x, down = np.array([1.0, 0.0, 0.0]), np.array([0.0, -1.0, 0.0])
-        targets = {}
-        for side, sign in (("Left", 1.0), ("Right", -1.0)):
-            targets |= {f"{side}Arm": sign * x, f"{side}ForeArm": sign * x}
-            targets |= {f"{side}UpLeg": down, f"{side}Leg": down}
-        return jnp.asarray(align_bones(self, targets, shape), jnp.float32)
-
     def with_rest(self, rest: Float[Array, "all 3"]) -> "Body":
-        """The body with other rest vertices [m], helpers included, whatever its shape."""
+        """The body with fixed rest vertices [m], helpers included, for every shape."""
         return dataclasses.replace(
             self, bases=jnp.stack([rest, rest]), deltas=jnp.zeros_like(self.deltas)
         )
@@ -189,7 +175,7 @@ class Body:
         return self.joint_names.index(name)
 
 
-# Compiled whole: operation by operation, each would be compiled for itself.
+# Compiled as a whole; otherwise every operation would be compiled separately.
 @jax.jit
 def _rest_vertices(bases: Array, deltas: Array, shape: Array) -> Array:
     male = shape[0]
@@ -206,14 +192,14 @@ def _joint_positions(rest: Array, rows: Array) -> tuple[Array, Array]:
 
 @jax.jit
 def triangulate(quads: Int[Array, "quads 4"]) -> Int[Array, "triangles 3"]:
-    """Two triangles a quad, along the diagonal from its first corner."""
+    """Splits each quad into two triangles along the diagonal from its first corner."""
     pairs = jnp.stack([quads[:, jnp.array([0, 1, 2])], quads[:, jnp.array([0, 2, 3])]], 1)
     return pairs.reshape(-1, 3)
 
 
 @functools.cache
 def load_body() -> Body:
-    """The built-in body.
+    """Loads the built-in body.
 
     Returns:
         The MakeHuman base mesh (CC0) with the `cmu_mb` rig, 31 joints.
@@ -233,7 +219,7 @@ def load_body() -> Body:
         )
     with importlib.resources.as_file(resource) as path, np.load(path) as data:
         arrays = {name: data[name] for name in data.files}
-    # What is kept mustn't belong to the program that happens to be traced.
+    # Cached arrays mustn't be tracers of an enclosing transformation.
     with jax.ensure_compile_time_eval():
         return _from_arrays(arrays)
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float, Int
 
 from ..geometry import matrix_from_quaternion
 
-# Skinning moves metres: a GPU's default of ten-bit mantissas would cost millimetres.
+# Positions span metres: the ten-bit mantissas that GPUs use by default would lose millimetres.
 _EXACT = jax.lax.Precision.HIGHEST
 
 
@@ -35,40 +35,45 @@ def forward_kinematics(
         World rotations and translations [m] of every joint.
     """
     joints = len(parents)
-    # A joint more, at the root and never turned: what the root hangs on.
+    # An extra joint at the root, never rotated, serves as the root's parent.
     level, above = (jnp.asarray(x) for x in _levels(parents))
-    over = np.array(parents)
-    offset = jnp.where(over[:, None] < 0, jnp.zeros((), heads.dtype), heads - heads[over])
+    parent_rows = np.array(parents)
+    offset = jnp.where(
+        parent_rows[:, None] < 0, jnp.zeros((), heads.dtype), heads - heads[parent_rows]
+    )
     offset = jnp.concatenate([offset, jnp.zeros((1, 3), heads.dtype)])
     local = matrix_from_quaternion(pose)
     one = jnp.eye(3, dtype=local.dtype)[None]
     local = jnp.concatenate([local, one])
-    # All but the last row are overwritten; what a scan carries has to vary over a mesh of
-    # devices (`jax.shard_map`) from its start as it does at its end.
-    world, place = local, root[None] + 0.0 * local[:, 0]
+    # All but the last row are overwritten. Under `jax.shard_map` a scan's carry has to vary
+    # over the devices at its start as it does at its end, hence the product with zero.
+    world, position = local, root[None] + 0.0 * local[:, 0]
 
     def descend(
         state: tuple[Array, Array], rows: tuple[Array, Array]
     ) -> tuple[tuple[Array, Array], None]:
-        world, place = state
+        world, position = state
         row, up = rows
         turn, here = world[up], jnp.minimum(row, joints)
-        # Sums written out: a product of small matrices takes many times as long to compile.
+        # Explicit sums: a product of small matrices takes many times as long to compile.
         turned = jnp.sum(turn[:, :, :, None] * local[here][:, None], axis=2)
-        moved = place[up] + jnp.sum(turn * offset[here][:, None], axis=2)
-        put = {"mode": "drop", "unique_indices": True}
-        return (world.at[row].set(turned, **put), place.at[row].set(moved, **put)), None
+        moved = position[up] + jnp.sum(turn * offset[here][:, None], axis=2)
+        scatter_options = {"mode": "drop", "unique_indices": True}
+        return (
+            world.at[row].set(turned, **scatter_options),
+            position.at[row].set(moved, **scatter_options),
+        ), None
 
-    (world, place), _ = jax.lax.scan(descend, (world, place), (level, above))
-    world, place = world[:joints], place[:joints]
-    return world, place - jnp.einsum("jab,jb->ja", world, heads, precision=_EXACT)
+    (world, position), _ = jax.lax.scan(descend, (world, position), (level, above))
+    world, position = world[:joints], position[:joints]
+    return world, position - jnp.einsum("jab,jb->ja", world, heads, precision=_EXACT)
 
 
 @functools.cache
 def _levels(
     parents: tuple[int, ...],
 ) -> tuple[Int[np.ndarray, "levels most"], Int[np.ndarray, "levels most"]]:
-    """Joints of equal depth, filled up with rows that don't exist, and their parents."""
+    """Joints grouped by depth, padded with out-of-range rows, and their parents."""
     spare = len(parents)
     depth: list[int] = []
     for parent in parents:
@@ -78,8 +83,10 @@ def _levels(
     level = np.tile(np.arange(spare + 1, spare + 1 + most, dtype=np.int32), (len(rows), 1))
     for into, row in zip(level, rows, strict=True):
         into[: len(row)] = row
-    over = np.array([spare if parent < 0 else parent for parent in (*parents, spare)], np.int32)
-    return level, over[np.minimum(level, spare)]
+    parent_rows = np.array(
+        [spare if parent < 0 else parent for parent in (*parents, spare)], np.int32
+    )
+    return level, parent_rows[np.minimum(level, spare)]
 
 
 def linear_blend_skinning(
@@ -88,7 +95,7 @@ def linear_blend_skinning(
     rotations: Float[Array, "joints 3 3"],
     translations: Float[Array, "joints 3"],
 ) -> Float[Array, "vertices 3"]:
-    """Vertices moved by the weighted mean of their joints' transforms.
+    """Moves vertices by the weighted mean of their joints' transforms.
 
     Args:
         vertices: Rest positions [m].
@@ -111,3 +118,15 @@ def blend_rotations(
     """The linear part of skinning: weighted means of joint rotations."""
     flat = rotations.reshape(rotations.shape[0], 9)
     return jnp.matmul(weights, flat, precision=_EXACT).reshape(-1, 3, 3)
+
+
+def skin_points(
+    rest: Float[Array, "points 3"],
+    weights: Float[Array, "points joints"],
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+) -> tuple[Float[Array, "points 3"], Float[Array, "points 3 3"]]:
+    """Skinned points [m] and the linear part of their skinning."""
+    blend = blend_rotations(weights, rotations)
+    shift = jnp.matmul(weights, translations, precision=_EXACT)
+    return jnp.einsum("pab,pb->pa", blend, rest, precision=_EXACT) + shift, blend

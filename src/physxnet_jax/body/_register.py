@@ -1,4 +1,4 @@
-"""The body laid onto somebody else's: pose, shape and then every vertex."""
+"""Registration of the body to another person's mesh: pose, shape, then every vertex."""
 
 import dataclasses
 import itertools
@@ -20,40 +20,41 @@ from ..geometry import (
     quaternion_from_axis_angle,
     vertex_normals,
 )
+from ._align import t_pose
 from ._body import NUM_BODY_VERTICES, Body, load_body
 from ._kinematics import blend_rotations, linear_blend_skinning
 from ._scan import Scan, nearest_facing
 
-# Pairs of points that a step of the fit sees, each way.
+# Pairs of points in a step of the fit, in each direction.
 _PAIRS = 800
-# Steps that tell which starts are good, which of the best few is best, and the rest.
+# Steps to rank all starts and then the best few, how many of these are kept, final steps.
 _TRIES, _KEPT, _STEPS = (5, 12), 4, 40
-_TURNS = tuple(range(0, 360, 45))
-_ALL_STEPS = 2 * len(_TURNS) * _TRIES[0] + _KEPT * _TRIES[1] + _STEPS
-# Cost of a turn [1/rad^2] beside mean squared distances in m^2: what clothes hang on turns
-# freely, hands and toes hardly.
+_YAWS = tuple(range(0, 360, 45))
+_ALL_STEPS = 2 * len(_YAWS) * _TRIES[0] + _KEPT * _TRIES[1] + _STEPS
+# Cost of a rotation [1/rad^2] relative to mean squared distances in m^2: joints that carry
+# clothes rotate freely, hands and toes hardly.
 _FREE, _STIFF, _LOCKED = 2e-5, 2e-4, 5e-3
 _SHAPE_COST, _SCALE_COST = 2e-5, 2e-3
-# Distance at which a pair counts a quarter [m]: at first, in the end, and from step to step.
+# Distance at which a pair's weight is a quarter [m]: initial, final and its factor per step.
 _WIDE, _NARROW, _NARROWING = 0.25, 0.02, 0.85
 # Largest change of a parameter in a step, and the range of shape parameters.
 _LONGEST_STEP, _SHAPES = 0.4, (-0.5, 1.3)
-# Share of the distance along normals in the last steps: surfaces may slide.
+# Share of the distance along normals in the last steps, so that surfaces may slide.
 _SLIDE = 0.7
-# Cost of differences along an edge, beside that of a vertex's distance, step by step: a
-# displacement spreads over about its square root in edges, which are about 1 cm long.
+# Cost of differences along an edge in each step, relative to that of a vertex's distance. A
+# displacement spreads over about the square root of it in edges, which are about 1 cm long.
 _STIFFNESS = (60.0, 25.0, 10.0, 4.0, 2.0)
-# Surfaces farther apart than this, or facing away, don't belong together [m].
+# Surfaces farther apart than this, or facing away, aren't matched [m].
 _REACH = 0.12
-# Farther than this on average, the two surfaces haven't met [m].
-_MET = 0.02
+# Largest mean distance between the surfaces of a successful registration [m].
+_MAX_MEAN_DISTANCE = 0.02
 # Vertices nearer than this after the last step lie on the surface [m].
 _CLOSE = 0.02
 
 
 @dataclasses.dataclass(frozen=True)
 class Registration:
-    """The body's vertices on another person's surface.
+    """Positions of the body's vertices on another person's surface.
 
     Attributes:
         rest: Rest positions [m] of all vertices, helpers included: the other person's
@@ -61,9 +62,9 @@ class Registration:
         posed: Body vertices on the other surface, shape [13380, 3].
         face: Face of the other mesh that carries each vertex, shape [13380].
         weights: Barycentric coordinates in it, shape [13380, 3].
-        distance: From vertex to surface as fitted by pose and shape alone [m], shape
-            [13380].
-        sure: Vertices that found a surface facing the same way nearby, shape [13380].
+        distance: Distance from vertex to surface after fitting pose and shape only [m],
+            shape [13380].
+        sure: Whether a surface that faces the same way is nearby, shape [13380].
     """
 
     rest: Float[np.ndarray, "all 3"]
@@ -78,7 +79,7 @@ class Registration:
         positions: Float[np.ndarray, "frames others 3"],
         faces: Int[np.ndarray, "faces 3"],
     ) -> Float[np.ndarray, "frames vertices 3"]:
-        """The body's vertices wherever the other mesh goes [m]."""
+        """Body vertices [m] that follow the other mesh through an animation."""
         corners = faces[self.face]
         out = np.zeros((len(positions), len(corners), 3), np.float32)
         for k in range(3):
@@ -93,28 +94,29 @@ def register_body(
     body: Body | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Registration:
-    """Lays the body onto a mesh of a standing person of any topology.
+    """Registers the body to a mesh of a standing person, of any topology.
 
-    Pose, shape and size are found first (Gauss-Newton on closest points both ways, from
-    several starts), then every vertex moves onto the surface, smoothly. Hands and face
-    aren't matched in detail: no cloth hangs there.
+    Pose, shape and size are fitted first (Gauss-Newton on closest points in both directions,
+    from several starts). Then every vertex moves smoothly onto the surface. Hands and face
+    aren't matched in detail because they carry no cloth.
 
     Args:
-        vertices: The person [m], Y up, limbs apart from each other.
+        vertices: Vertices of the person [m], Y up, limbs apart from each other.
         faces: Triangles; they face outwards.
-        body: What is laid onto it; the built-in body by default.
-        progress: Called with a stage, steps done and steps in all.
+        body: The body to register; the built-in one by default.
+        progress: Called with the stage, the steps done and the total number of steps.
 
     Returns:
-        The body on that surface, and its rest pose of those proportions.
+        The body on the person's surface, and its rest pose with the person's proportions.
 
     Raises:
-        MeshError: The surfaces don't meet: no person, or in a pose too far from standing.
+        MeshError: The surfaces don't match: the mesh isn't a person, or its pose is too far
+            from standing.
 
     References:
         Allen et al., The space of human body shapes (SIGGRAPH 2003), section 4: template
-        and scan, smooth displacements. Bouaziz et al., Sparse ICP (2013): why far pairs
-        count less.
+        and scan, smooth displacements. Bouaziz et al., Sparse ICP (2013): lower weights
+        of far pairs.
     """
     body = load_body() if body is None else body
     target = Scan(np.asarray(vertices, np.float64), np.asarray(faces))
@@ -124,11 +126,11 @@ def register_body(
     best = min((fit.run(p, _TRIES[1]) for p, _ in kept), key=lambda found: found[1])[0]
     params = fit.run(best, _STEPS, last=True)[0]
     rest, world, shift = fit.posed_parts(params)
-    return _moved_onto(body, target, rest, world, shift)
+    return _project_to_surface(body, target, rest, world, shift)
 
 
 class _Fit:
-    """Pose, shape and size by Gauss-Newton on closest points."""
+    """Fits pose, shape and size by Gauss-Newton on closest points."""
 
     def __init__(
         self,
@@ -144,30 +146,30 @@ class _Fit:
         self.height = float(np.ptp(up))
         self.hips = float(body.joint_positions(whole)[0][0, 1] - up.min())
         rng = np.random.default_rng(1)
-        # By area: a third of the vertices are in face and hands.
+        # Sampled by area, as a third of the vertices are in the face and hands.
         share = np.where(clothed_vertices(body), _areas(np.asarray(whole), self.faces), 0.0)
-        self.ours = rng.choice(NUM_BODY_VERTICES, _PAIRS, replace=False, p=share / share.sum())
-        self.theirs = rng.choice(len(target.points), _PAIRS, replace=False)
+        self.body_rows = rng.choice(NUM_BODY_VERTICES, _PAIRS, replace=False, p=share / share.sum())
+        self.target_rows = rng.choice(len(target.points), _PAIRS, replace=False)
         cost = []
         for name in body.joint_names:
             stiff = any(part in name for part in ("Hand", "Thumb", "Finger", "Toe", "HipJoint"))
             trunk = any(part in name for part in ("Spine", "Neck", "Head", "Back", "Shoulder"))
             cost.append(_LOCKED if stiff else _STIFF if trunk else _FREE)
         cost[0] = 0.0
-        self.turn_cost = np.repeat(cost, 3)
+        self.rotation_cost = np.repeat(cost, 3)
 
     def starts(self) -> list[np.ndarray]:
-        """Arms as in the A-pose or held out, facing any way, of the same height."""
+        """Initial parameters: A-pose and T-pose in several orientations, at the person's height."""
         t, rest = self.target.points, self.body.a_pose()
         scale = float(np.ptp(t[:, 1])) / self.height
         middle = 0.5 * (t.max(axis=0) + t.min(axis=0))
         out = []
-        poses = (np.asarray(rest), np.asarray(self.body.t_pose()))
-        for pose, yaw in itertools.product(poses, _TURNS):
+        poses = (np.asarray(rest), np.asarray(t_pose(self.body)))
+        for pose, yaw in itertools.product(poses, _YAWS):
             p = np.zeros(self.size)
-            turns = Rotation.from_quat(pose, scalar_first=True).as_rotvec()
-            turns[0] = Rotation.from_euler("Y", yaw, degrees=True).as_rotvec()
-            p[: 3 * len(pose)] = turns.ravel()
+            rotations = Rotation.from_quat(pose, scalar_first=True).as_rotvec()
+            rotations[0] = Rotation.from_euler("Y", yaw, degrees=True).as_rotvec()
+            p[: 3 * len(pose)] = rotations.ravel()
             p[-4:-1] = (middle[0], t[:, 1].min() + scale * self.hips, middle[2])
             p[-1] = np.log(scale)
             out.append(p)
@@ -175,26 +177,26 @@ class _Fit:
 
     @property
     def size(self) -> int:
-        """Parameters: turns, shape, place of the hips, logarithm of the size."""
+        """Number of parameters: rotations, shape, position of the hips, logarithm of the scale."""
         return 3 * len(self.body.parents) + len(self.body.shape_names) + 4
 
     def run(self, start: np.ndarray, steps: int, *, last: bool = False) -> tuple[np.ndarray, float]:
-        """Parameters after some steps, and the distance left [m]."""
+        """Returns the parameters after some steps, and the mean distance that remains [m]."""
         p, goal = start.copy(), start.copy()
         joints = 3 * len(self.body.parents)
         goal[joints:-4] = 0.0
         goal[-1] = 0.0
         cost = np.concatenate(
-            [self.turn_cost, np.full(len(self.body.shape_names), _SHAPE_COST), np.zeros(3)]
+            [self.rotation_cost, np.full(len(self.body.shape_names), _SHAPE_COST), np.zeros(3)]
         )
         cost = np.append(cost, _SCALE_COST if last else 0.0)
-        left = np.inf
+        remaining = np.inf
         for k in range(steps):
             rows, points, normals, distance = self._pairs(p)
-            # Far pairs are likely wrong: they count less and less.
+            # Far pairs are likely wrong: their weights decrease from step to step.
             scale = max(_WIDE * _NARROWING**k, _NARROW)
             weight = 1.0 / (1.0 + (distance / scale) ** 2) ** 2
-            left = float(np.minimum(distance, 0.3).mean())
+            remaining = float(np.minimum(distance, 0.3).mean())
             weight = np.where(np.isfinite(distance), weight, 0.0) / len(rows)
             slide = _SLIDE if last and k > steps // 2 else 0.0
             hessian, slope = _normal_equations(
@@ -214,32 +216,35 @@ class _Fit:
             self.done += 1
             if self.progress is not None:
                 self.progress("fitting the body", self.done, _ALL_STEPS)
-        return p, left
+        return p, remaining
 
     def _pairs(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Our vertices with the points they should be at, both ways."""
+        """Body vertices with matching points, normals and distances, in both directions."""
         x = np.asarray(_posed(self.body, jnp.asarray(p, jnp.float32))[0], np.float64)
         n = np.asarray(
             vertex_normals(jnp.asarray(x, jnp.float32), jnp.asarray(self.faces)), np.float64
         )
-        row, there = self.target.nearest(x[self.ours], n[self.ours])
-        points, normals = self.target.points[self.theirs], self.target.normals[self.theirs]
+        row, distance_to_target = self.target.nearest(x[self.body_rows], n[self.body_rows])
+        points, normals = (
+            self.target.points[self.target_rows],
+            self.target.normals[self.target_rows],
+        )
         back, distance = nearest_facing(KDTree(x), n, points, normals)
         return (
-            np.concatenate([self.ours, back]),
+            np.concatenate([self.body_rows, back]),
             np.concatenate([self.target.points[row], points]),
             np.concatenate([self.target.normals[row], normals]),
-            np.concatenate([there, distance]),
+            np.concatenate([distance_to_target, distance]),
         )
 
     def posed_parts(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rest vertices in the size found, and the joints' transforms."""
+        """Rest vertices at the fitted scale, and the joints' transforms."""
         _, rest, world, shift = _posed(self.body, jnp.asarray(p, jnp.float32))
         return np.asarray(rest), np.asarray(world), np.asarray(shift)
 
 
 def _parts(body: Body, p: Array) -> tuple[Array, Array, Array]:
-    """Rest vertices and transforms of the joints."""
+    """Rest vertices and joint transforms for given parameters."""
     joints = len(body.parents)
     shape = p[3 * joints : -4]
     rest = jnp.exp(p[-1]) * body.rest_vertices(shape)
@@ -265,8 +270,8 @@ def _normal_equations(
     p: Array,
     slide: Array,
 ) -> tuple[Array, Array]:
-    """Of weighted distances to points, of which a share ``slide`` along the normals."""
-    # Shape and joints need few of the vertices: those of the pairs and the joint markers.
+    """Normal equations of weighted distances; a share ``slide`` counts along normals only."""
+    # Only the vertices of the pairs and the joint markers are needed.
     used = jnp.concatenate([rows, body.joint_rows.reshape(-1)])
     count = rows.shape[0]
     small = dataclasses.replace(
@@ -292,10 +297,10 @@ def _normal_equations(
     )
 
 
-def _moved_onto(
+def _project_to_surface(
     body: Body, target: Scan, rest: np.ndarray, world: np.ndarray, shift: np.ndarray
 ) -> Registration:
-    """Every vertex onto the surface, and back into the rest pose."""
+    """Moves every vertex onto the surface, then back into the rest pose."""
     weights = body.weights[:NUM_BODY_VERTICES]
     faces = jnp.asarray(body.rest_mesh().faces)
     x0 = np.asarray(
@@ -315,17 +320,17 @@ def _moved_onto(
         pull = sp.diags(sure + 1e-6) + stiffness * laplacian
         x = x + splu(pull.tocsc()).solve(sure[:, None] * (target.points[row] - x)).astype(x.dtype)
     met = float(np.mean(near[clothed_vertices(body)]))
-    if met > _MET:
+    if met > _MAX_MEAN_DISTANCE:
         raise MeshError(
-            f"The body can't be laid onto this mesh: {1e3 * met:.0f} mm lie between them on"
-            " average. It takes a person who stands with limbs apart in the first frame, or"
-            " a skin whose bind pose does."
+            f"The body can't be registered to this mesh: {1e3 * met:.0f} mm lie between them"
+            " on average. The mesh must show a person standing with limbs apart in the"
+            " first frame or in the bind pose."
         )
     n = np.asarray(vertex_normals(jnp.asarray(x), faces))
-    face, bary, distance = target.feet(x, n)
+    face, bary, distance = target.closest_facing(x, n)
     sure = distance < _CLOSE
     posed = np.einsum("vk,vkc->vc", bary, target.vertices[target.faces[face]])
-    # What didn't find the surface keeps where smoothness put it, and hangs on what is near.
+    # Vertices without a match keep their smoothed positions and follow a nearby face.
     blend = np.asarray(blend_rotations(weights, jnp.asarray(world)), np.float64)
     moved = np.asarray(weights, np.float64) @ shift
     flat = np.linalg.solve(blend, (x - moved)[:, :, None])[:, :, 0]
@@ -359,7 +364,7 @@ def _areas(
 
 
 def _laplacian() -> sp.csr_matrix:
-    """Of the body's mesh as a graph."""
+    """Graph Laplacian of the body's mesh."""
     edges = mesh_edges(np.asarray(load_body().rest_mesh().faces)).vertices
     ones = np.ones(len(edges))
     shape = (NUM_BODY_VERTICES, NUM_BODY_VERTICES)
@@ -371,7 +376,7 @@ def _laplacian() -> sp.csr_matrix:
 def _with_helpers(
     rest: Float[np.ndarray, "all 3"], flat: Float[np.ndarray, "vertices 3"]
 ) -> Float[np.ndarray, "all 3"]:
-    """Helper vertices moved as the skin around them, which may be all round a limb."""
+    """Moves helper vertices with the skin around them, which may surround a limb."""
     old = rest[:NUM_BODY_VERTICES]
     others = rest[NUM_BODY_VERTICES:]
     distance, row = KDTree(old).query(others, k=48)

@@ -1,4 +1,4 @@
-"""Another person's surface, as points with normals."""
+"""A person's surface, sampled as points with normals."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -7,23 +7,23 @@ from scipy.spatial import KDTree
 from ..errors import MeshError
 from ..geometry import closest_among, make_mesh
 
-# Points on the surface: four millimetres apart on a grown person.
+# Sample points on the surface, four millimetres apart on an adult.
 _POINTS = 40_000
-# Cosine of the widest angle between normals of the same side.
+# Cosine of the largest angle between normals that face the same way.
 _FACING = 0.3
 
 
 class Scan:
-    """A person's surface, asked for its nearest point that faces the same way.
+    """A person's surface, for queries of the nearest point that faces the same way.
 
     Args:
-        vertices: Of the mesh [m], shape [vertices, 3].
+        vertices: Vertices of the mesh [m], shape [vertices, 3].
         faces: Triangles, shape [faces, 3].
 
     Attributes:
-        points: Points spread evenly over it [m], shape [points, 3].
-        normals: Its unit normals there, shape [points, 3].
-        face: The faces they lie on, shape [points].
+        points: Sample points, spread evenly over the surface [m], shape [points, 3].
+        normals: Unit normals of the surface there, shape [points, 3].
+        face: The faces that the points lie on, shape [points].
 
     Raises:
         MeshError: The mesh has no area.
@@ -52,7 +52,7 @@ class Scan:
         """Row of the nearest sample that faces the same way, and its distance [m]."""
         return nearest_facing(self.tree, self.normals, points, normals, neighbours)
 
-    def feet(
+    def closest_facing(
         self, points: np.ndarray, normals: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Closest points on faces that face the same way: face, weights, distance [m]."""
@@ -60,8 +60,8 @@ class Scan:
         facing = np.einsum("nkc,nc->nk", self.normals[row], normals) > _FACING
         first = np.where(facing.any(axis=1), facing.argmax(axis=1), 0)
         face = self.face[row]
-        mine = np.take_along_axis(face, first[:, None], axis=1)
-        face = np.where(facing, face, mine).astype(np.int32)
+        fallback = np.take_along_axis(face, first[:, None], axis=1)
+        face = np.where(facing, face, fallback).astype(np.int32)
         mesh = make_mesh(self.vertices.astype(np.float32), self.faces)
         found = closest_among(mesh, jnp.asarray(points, jnp.float32), jnp.asarray(face))
         distance = np.sqrt(np.asarray(found.squared_distance))
@@ -76,17 +76,17 @@ def nearest_facing(
     normals: np.ndarray,
     neighbours: int = 12,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the nearest rows of a tree the first that faces as a point does.
+    """Finds the nearest row of a tree that faces the same way as each query point.
 
     Args:
-        tree: Points that are searched [m].
+        tree: Points to search [m].
         tree_normals: Their unit normals.
         points: Query points [m].
         normals: Their unit normals.
-        neighbours: Rows that are looked at.
+        neighbours: Number of nearest rows to consider.
 
     Returns:
-        The rows and their distances [m]; infinite where none faces the same way.
+        The rows and their distances [m], infinite if no row faces the same way.
     """
     distance, row = map(np.asarray, tree.query(points, k=neighbours))
     facing = np.einsum("nkc,nc->nk", tree_normals[row], normals) > _FACING

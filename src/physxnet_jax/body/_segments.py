@@ -23,7 +23,7 @@ def body_segments(
 
     Args:
         weights: Skinning weights of skin or cloth.
-        body: Whose joints they refer to.
+        body: The body whose joints the weights refer to.
 
     Returns:
         `TRUNK`, or one of `THIGHS`, `CALVES` (with the foot), `UPPER_ARMS`, `FOREARMS`

@@ -9,17 +9,25 @@ from rich.console import Console
 from rich.table import Table
 
 from ..evaluation import JITTER, Work, bench_scenes, bench_simulation, time_to_error
-from ..files import whole_file, write_json
-from ..io import load_garment
+from ..files import atomic_write, write_json
+from ..garment import load_garment
 from ..motion import load_motion
 from ..viewer import draw_work_precision
+from ._bench_net import bench_net
 from ._experiment_commands import Bench
 from ._machine import machine
 from ._rows import check_rows_file, kept_rows
 
 
 def bench(command: Bench, console: Console) -> int:
-    """Measures row by row; each is kept as soon as it is there."""
+    """Measures the simulator or the networks."""
+    return (
+        bench_simulator(command, console) if command.what == "sim" else bench_net(command, console)
+    )
+
+
+def bench_simulator(command: Bench, console: Console) -> int:
+    """Measures row by row, and saves each as soon as it is complete."""
     check_rows_file(command.out)
     shirt = None if command.shirt is None else load_garment(command.shirt)[0]
     action = None if command.motion == "punch" else load_motion(command.motion, fps=30.0)
@@ -40,7 +48,7 @@ def bench(command: Bench, console: Console) -> int:
     for b in scenes:
         console.print(_table(b.name, rows))
     if command.out is not None:
-        with whole_file(command.out.with_suffix(".md")) as part:
+        with atomic_write(command.out.with_suffix(".md")) as part:
             part.write_text(_markdown(rows))
         draw_work_precision(
             command.out.with_suffix(".png"),

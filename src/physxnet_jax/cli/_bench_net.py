@@ -1,4 +1,4 @@
-"""`physxnet bench net`: what networks cost and how far they are off, beside the others."""
+"""`physxnet bench net`: cost and error of networks, skinning and simulators."""
 
 import dataclasses
 import json
@@ -12,25 +12,22 @@ import jax
 from rich.console import Console
 
 from ..data import Sequence as Action, list_sequences, read_sequence
-from ..dressing import (
+from ..dressing import EXTERNAL_ENGINES, Precision
+from ..errors import FormatError
+from ..evaluation import (
     Cost,
-    Precision,
     mean_errors,
     method_by_name,
     network_costs,
     network_errors,
     other_costs,
+    parse_method,
     present_devices,
-    weights_folder,
 )
-from ..errors import FormatError
-from ..evaluation import ENGINES
-from ..files import whole_file, write_json
+from ..files import atomic_write, write_json
 from ..garment import TEMPLATES, Template
-from ..io import load_predictor
-from ..models import at_precision
 from ..motion import load_motion
-from ..simulation import ACCURACY
+from ..simulation import PRESETS
 from ..viewer import draw_work_precision
 from ._experiment_commands import Bench
 from ._progress import progress_bars
@@ -38,7 +35,7 @@ from ._rows import check_rows_file, kept_rows, measured_on, weights_digest
 
 
 def bench_net(command: Bench, console: Console) -> int:
-    """Measures method by method; the rows of each are kept as soon as they are there."""
+    """Measures method by method, and saves the rows of each as soon as they are complete."""
     check_rows_file(command.out)
     tests: list[Action] = []
     if command.data is not None:
@@ -50,10 +47,10 @@ def bench_net(command: Bench, console: Console) -> int:
         raise FormatError(f"--garments are numbers from 1 to {len(TEMPLATES)}.")
     names = [pathlib.Path(w).name for w in command.weights]
     if len(set(names)) < len(names):
-        raise FormatError("two networks are called the same; rename a run's folder.")
+        raise FormatError("two networks have the same name; rename a run's folder.")
     rows = kept_rows(command.out, _from_json)
     if command.times and not rows:
-        raise FormatError("--times measures rows of --out again, and there are none.")
+        raise FormatError("--times measures rows of --out again, but there are none.")
     digests = {pathlib.Path(w).name: weights_digest(w) for w in command.weights}
     for r in rows:
         if r.weights and digests.get(r.size, "") not in ("", r.weights):
@@ -62,43 +59,47 @@ def bench_net(command: Bench, console: Console) -> int:
                 " another --out, or delete that file."
             )
     rows = [_with_evaluated(r, known_errors) for r in rows]
-    noted = measured_on(command.out)
+    recorded = measured_on(command.out)
     plain: Precision = "float32"
     jobs: list[tuple[str, str, Precision]] = [("lbs", "-", plain)]
-    jobs.extend(("engine" if s in ENGINES else "simulator", s, plain) for s in command.simulator)
+    jobs.extend(
+        ("engine" if s in EXTERNAL_ENGINES else "simulator", s, plain) for s in command.simulator
+    )
     jobs.extend(("network", w, p) for w in command.weights for p in command.precisions)
     here = present_devices()
-    # Engines run out of process, on the processor.
+    # External engines run in their own process, on the CPU.
     work = [(d, *job) for job in jobs for d in (here[-1:] if job[0] == "engine" else here)]
     with progress_bars(console) as progress:
         for k, (device, kind, size, precision) in enumerate(work):
             progress("methods", k, len(work))
             name = pathlib.Path(size).name
             where = (kind, name, precision, device.device_kind)
-            # The rows of a network without and with push-out come together.
-            known = [r for r in rows if _what(r) == where]
+            # A network is measured without and with collision resolution at once.
+            known = [r for r in rows if _measurement_key(r) == where]
             with jax.default_device(device):
                 if command.times:
-                    # Errors don't change; a method without any isn't measured anew.
-                    again = _measure(kind, size, precision, _as(command, known), [], {})
-                    there = set(map(_key, known))
-                    anew = [r for r in (again if known else ()) if _key(r) in there]
+                    # Errors are kept; a method without rows isn't measured.
+                    timed = _measure(kind, size, precision, _narrow_command(command, known), [], {})
+                    present = set(map(_key, known))
+                    retimed = [r for r in (timed if known else ()) if _key(r) in present]
                     rows = [r for r in rows if r not in known]
-                    rows += [_with_errors(r, known) for r in anew]
+                    rows += [_with_errors(r, known) for r in retimed]
                 else:
-                    for some in _missing(command, known) if kind == "network" or not known else ():
-                        rows += list(_measure(kind, size, precision, some, tests, known_errors))
-            # Every method compiles for itself; kept, programs would take all memory maps.
+                    for subset in (
+                        _unmeasured(command, known) if kind == "network" or not known else ()
+                    ):
+                        rows += list(_measure(kind, size, precision, subset, tests, known_errors))
+            # Every method compiles its own programs; cached, they would use up all memory maps.
             jax.clear_caches()
-            rows.sort(key=_place)
+            rows.sort(key=_sort_key)
             if command.out is not None:
                 data = [_to_json(r) for r in rows]
-                write_json(command.out, {"machine": noted, "rows": data})
+                write_json(command.out, {"machine": recorded, "rows": data})
         progress("methods", len(work), len(work))
     text = markdown(rows)
     console.print(text, markup=False, highlight=False, soft_wrap=True)
     if command.out is not None:
-        with whole_file(command.out.with_suffix(".md")) as part:
+        with atomic_write(command.out.with_suffix(".md")) as part:
             part.write_text(text)
         draw_work_precision(
             command.out.with_suffix(".png"), points(rows), floors(rows), engines(rows)
@@ -107,8 +108,8 @@ def bench_net(command: Bench, console: Console) -> int:
     return 0
 
 
-def _what(row: Cost) -> tuple[str, str, str, str]:
-    """What one measurement gives the rows of."""
+def _measurement_key(row: Cost) -> tuple[str, str, str, str]:
+    """The key that rows of one measurement share."""
     return row.method.partition("+")[0], row.size, row.precision, row.device
 
 
@@ -116,8 +117,8 @@ def _key(row: Cost) -> tuple[str, int, int]:
     return row.method, row.garments, row.batch
 
 
-def _as(command: Bench, known: Sequence[Cost]) -> Bench:
-    """The command that measured these rows."""
+def _narrow_command(command: Bench, known: Sequence[Cost]) -> Bench:
+    """The command with the garments, batches and gradients of these rows."""
     return dataclasses.replace(
         command,
         garments=tuple(sorted({r.garments for r in known})),
@@ -126,12 +127,12 @@ def _as(command: Bench, known: Sequence[Cost]) -> Bench:
     )
 
 
-def _missing(command: Bench, known: Sequence[Cost]) -> Iterator[Bench]:
-    """What a command asks for of a network beyond the rows that are there."""
-    there = {(r.garments, r.batch) for r in known}
+def _unmeasured(command: Bench, known: Sequence[Cost]) -> Iterator[Bench]:
+    """Commands for those garments and batches of a network that have no rows yet."""
+    present = {(r.garments, r.batch) for r in known}
     lacking: dict[tuple[int, ...], list[int]] = {}
     for g in command.garments:
-        batches = tuple(b for b in command.batches if (g, b) not in there)
+        batches = tuple(b for b in command.batches if (g, b) not in present)
         if batches:
             lacking.setdefault(batches, []).append(g)
     for batches, garments in lacking.items():
@@ -139,7 +140,7 @@ def _missing(command: Bench, known: Sequence[Cost]) -> Iterator[Bench]:
 
 
 def _with_evaluated(row: Cost, evaluated: Mapping[str, dict[Template, float]]) -> Cost:
-    """A row with the errors that `physxnet evaluate` gives its method now."""
+    """A row with the current errors of its method, from `physxnet evaluate`."""
     name = {"lbs": "lbs", "network+push": f"{row.size}+push"}.get(row.method, row.size)
     found = evaluated.get(name, {})
     worn = TEMPLATES[: row.garments]
@@ -152,22 +153,22 @@ def _with_evaluated(row: Cost, evaluated: Mapping[str, dict[Template, float]]) -
 
 
 def _with_errors(row: Cost, known: Sequence[Cost]) -> Cost:
-    """A row that was timed again, with the errors it had: a garment's doesn't change."""
+    """A newly timed row with the errors of the earlier rows."""
     same = [r for r in known if r.method == row.method]
     each = {t: e for r in same for t, e in r.rmse_each.items()}
-    mine = {t: each[t] for t in TEMPLATES[: row.garments] if t in each}
-    mean = statistics.fmean(mine.values()) if len(mine) == row.garments else math.nan
-    # Not all that was measured says what each garment's is.
+    of_garments = {t: each[t] for t in TEMPLATES[: row.garments] if t in each}
+    mean = statistics.fmean(of_garments.values()) if len(of_garments) == row.garments else math.nan
+    # Some rows lack the errors of individual garments.
     mean = next((r.rmse_mm for r in same if r.garments == row.garments), mean)
-    return dataclasses.replace(row, rmse_mm=mean, rmse_each=mine)
+    return dataclasses.replace(row, rmse_mm=mean, rmse_each=of_garments)
 
 
-def _place(row: Cost) -> tuple[object, ...]:
-    """Where a row stands in the table, whichever was measured first."""
+def _sort_key(row: Cost) -> tuple[object, ...]:
+    """Sort key of a row, independent of the order of measurement."""
     kind = row.method.partition("+")[0]
     place = ("lbs", "simulator", "engine", "network").index(kind)
-    # From the coarsest on, as a line through them goes.
-    finer = [*ACCURACY].index(row.size) if row.size in ACCURACY else -1
+    # From coarse to fine: the diagram joins the points in this order.
+    finer = [*PRESETS].index(row.size) if row.size in PRESETS else -1
     which = row.size, row.precision, row.device, row.method
     return place, row.params, finer, *which, row.garments, row.batch
 
@@ -189,16 +190,14 @@ def _measure(
             errors = {} if kind == "engine" else mean_errors(method, tests, TEMPLATES)
         yield from other_costs(kind, size, method, walk, errors)
         return
-    source = weights_folder(size)
-    predictor = at_precision(load_predictor(source), precision)
-    # Evaluated were the weights as they are.
-    ways = ("network", size), ("network+push", f"{size}+push")
-    found = {w: evaluated[n] for w, n in ways if precision == "float32" and n in evaluated}
-    if len(found) < len(ways):
-        found = network_errors(predictor, tests)
+    inference = parse_method(size)
+    # `physxnet evaluate` runs the networks in float32.
+    variants = ("network", size), ("network+push", f"{size}+push")
+    found = {w: evaluated[n] for w, n in variants if precision == "float32" and n in evaluated}
+    if len(found) < len(variants):
+        found = network_errors(inference, tests, precision=precision)
     for row in network_costs(
-        source,
-        predictor,
+        inference,
         walk,
         found,
         batches=command.batches,
@@ -220,7 +219,7 @@ def _evaluated(path: pathlib.Path | None) -> dict[str, dict[Template, float]]:
                 found = each.setdefault(r["method"], {}).setdefault(r["template"], [])
                 found.append(float(r["rmse_vertices_mm"]))
     except (ValueError, TypeError, KeyError):
-        raise FormatError(f"{path}: no rows of `physxnet evaluate`; name its --out file.") from None
+        raise FormatError(f"{path}: no results of `physxnet evaluate`; name its --out.") from None
     return {
         m: {t: statistics.fmean(x) for t, x in of.items()}
         for m, of in each.items()
@@ -229,7 +228,7 @@ def _evaluated(path: pathlib.Path | None) -> dict[str, dict[Template, float]]:
 
 
 def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
-    """What is drawn: a panel for each number of garments, a line through a method's sizes."""
+    """Points of the diagram: a panel for each number of garments, a line for each method."""
     panels = {r.garments for r in rows if r.method.startswith("network")}
     several = len({r.device for r in rows}) > 1
     out = []
@@ -237,7 +236,7 @@ def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
         if math.isnan(r.rmse_mm) or (panels and r.garments not in panels) or _is_noise(r):
             continue
         name = r.method if r.precision == "float32" else f"{r.method} {r.precision}"
-        # Another family is no rung of the same ladder.
+        # A network of another family isn't a size of the same one: it gets its own line.
         name = f"{name} (paper)" if r.size == "paper" else name
         if r.method.startswith("network"):
             name += ", live" if r.batch == 1 else f", {r.batch} frames"
@@ -248,12 +247,12 @@ def points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
 
 
 def floors(rows: Sequence[Cost]) -> dict[str, float]:
-    """What two runs of the simulator that should be one differ by, for each panel."""
+    """Noise floor of each panel [mm]: the error of a perturbed simulation."""
     return {_panel(r): r.rmse_mm for r in rows if _is_noise(r) and not math.isnan(r.rmse_mm)}
 
 
 def engines(rows: Sequence[Cost]) -> dict[str, dict[str, float]]:
-    """What cloth engines take [ms a frame], for each panel."""
+    """Times of external engines [ms per frame], for each panel."""
     panels = {p[0] for p in points(rows)}
     out: dict[str, dict[str, float]] = {}
     for r in rows:
@@ -267,7 +266,7 @@ def _panel(row: Cost) -> str:
 
 
 def _is_noise(row: Cost) -> bool:
-    return (row.method, row.size) == ("simulator", "noise")
+    return (row.method, row.size) == ("simulator", "perturbed")
 
 
 def _to_json(row: Cost) -> dict[str, Any]:
@@ -302,7 +301,7 @@ _COLUMNS = (
 
 
 def markdown(rows: list[Cost]) -> str:
-    """One table, a line for each row; the device is told where there are several."""
+    """A Markdown table of the rows; it names the devices if there are several."""
     several = len({r.device for r in rows}) > 1
     columns = (*_COLUMNS[:2], *(["device"] if several else []), *_COLUMNS[2:])
     lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
@@ -329,5 +328,5 @@ def markdown(rows: list[Cost]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _number(value: float, how: str) -> str:
-    return "" if math.isnan(value) else format(value, how)
+def _number(value: float, spec: str) -> str:
+    return "" if math.isnan(value) else format(value, spec)

@@ -6,6 +6,16 @@ from typing import Annotated, Literal
 
 import tyro
 
+from ._options import (
+    BodyOptions,
+    Console,
+    InferenceOptions,
+    MotionSource,
+    Outfit,
+    Output,
+    SimulationOptions,
+)
+
 
 @dataclasses.dataclass(frozen=True)
 class Dress:
@@ -14,70 +24,75 @@ class Dress:
     Examples:
       physxnet dress walk --wear top bottom -o walk.usdc
       physxnet dress 02_04.amc --wear dress --preview dress.mp4
-      physxnet dress dance.bvh --wear my_shirt.obj bottom --method simulate -o out.pc2
+      physxnet dress dance.bvh --wear coat.obj:as=top,fabric=wool bottom --method simulate -o o.pc2
       physxnet dress walk --wear dress --budget-ms 5 -o walk.usdc
-      physxnet dress my_dancer.glb --own-body --wear top bottom -o dancer.usdc
+      physxnet dress my_dancer.glb --animated-body --wear top bottom -o dancer.usdc
       physxnet dress dance.bvh --character my_avatar.vrm --wear dress -o avatar.glb
     """
 
     motion: tyro.conf.Positional[str]
     """A .bvh, .amc, .glb, .gltf, .vrma or .npz file, or a built-in clip (see `physxnet clips`)."""
-    wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and files (.obj, .glb, .gltf, .usd*, .ply, .stl; coat.obj=top
-    says what one is dressed as): tops over dresses over trousers, of two of one kind the second
-    over the first."""
-    own_body: bool = False
-    """The file is a person of your own to be dressed: .glb, .usd, .pc2, .mdd (with OBJ), .npz."""
-    character: pathlib.Path | None = None
-    """A rigged person of your own (.glb, .gltf, .vrm), whom the motion moves."""
-    character_map: pathlib.Path | None = None
-    """Joint names of --character, for unknown ones: TOML lines like Hips = "pelvis"."""
-    body_mesh: str | None = None
-    """Of --own-body and --character: name of the body's mesh, in a file of several."""
-    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Result: .usdc, .usd, .usda, .pc2, .mdd (with OBJ), .glb, .html, .obj (one a frame), .npz."""
-    preview: pathlib.Path | None = None
-    """Picture or video: .png, .gif or .mp4."""
     method: Literal["network", "lbs", "simulate"] = "network"
     """network (packaged weights), lbs (skinning alone) or simulate (the teacher)."""
-    accuracy: Literal["draft", "standard", "fine"] = "standard"
-    """Of simulate."""
     budget_ms: float | None = None
-    """Pick the method: the most accurate within this time a frame on this machine."""
+    """Select the most accurate method within this time per frame on this machine [ms]."""
     max_error_mm: float | None = None
-    """Pick the method: the fastest within this error on the test actions."""
-    fps: float = 30.0
-    """Frames a second of the result."""
-    start: float = 0.0
-    """Begin at this second of the motion."""
-    frames: int | None = None
-    """Stop after this many frames."""
-    source_fps: float | None = None
-    """True rate of the motion file, where its header is wrong or silent."""
-    skeleton: pathlib.Path | None = None
-    """The ASF of an AMC file, if it doesn't lie beside it."""
-    joint_map: pathlib.Path | None = None
-    """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
-    weights: str = "local+relax"
-    """Name or folder of network weights; with +mirror the mirrored person is asked too, with
-    +relax the cloth's edges are brought back to their lengths."""
-    shape: tuple[str, ...] = ()
-    """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
-    body: bool = True
-    """Put the body into the result."""
-    push_out: bool = True
-    """Push vertices that end inside the body onto it."""
-    json: bool = False
-    """Print JSON for machines instead of tables."""
-    quiet: bool = False
-    """Print nothing but errors."""
-    debug: bool = False
-    """Show the trace of an error."""
+    """Select the fastest method within this error on the test actions [mm]."""
+    source: MotionSource = dataclasses.field(default_factory=MotionSource)
+    outfit: Outfit = dataclasses.field(default_factory=Outfit)
+    person: BodyOptions = dataclasses.field(default_factory=BodyOptions)
+    inference: InferenceOptions = dataclasses.field(default_factory=InferenceOptions)
+    simulation: SimulationOptions = dataclasses.field(default_factory=SimulationOptions)
+    output: Output = dataclasses.field(default_factory=Output)
+
+
+@dataclasses.dataclass(frozen=True)
+class Simulate:
+    """Simulate a scene: a motion with garments, or a scene file (TOML).
+
+    An interrupted run resumes where it stopped.
+
+    Examples:
+      physxnet simulate walk --wear bottom top -o walk.usdc
+      physxnet simulate punch --wear top:fabric=silk --wind 0 0 4 --preview punch.mp4
+      physxnet simulate scene.toml -o scene.npz
+    """
+
+    scene: tyro.conf.Positional[str]
+    """A scene file (.toml), a motion file, or a built-in clip."""
+    source: MotionSource = dataclasses.field(default_factory=MotionSource)
+    outfit: Outfit = dataclasses.field(default_factory=Outfit)
+    person: BodyOptions = dataclasses.field(default_factory=BodyOptions)
+    simulation: SimulationOptions = dataclasses.field(default_factory=SimulationOptions)
+    output: Output = dataclasses.field(default_factory=Output)
+
+
+@dataclasses.dataclass(frozen=True)
+class Effects:
+    """Measure what each effect of a scene costs and changes, by removing it.
+
+    Examples:
+      physxnet effects walk --wear top --frames 20
+      physxnet effects scene.toml --recommend -o effects.json
+    """
+
+    scene: tyro.conf.Positional[str]
+    """A scene file (.toml), a motion file, or a built-in clip."""
+    recommend: bool = False
+    """Report which effects matter, including those that the scene doesn't have."""
+    tolerance: float = 2.0
+    """Differences below this are ignored [mm]."""
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Write the rows to this file, as JSON."""
+    source: MotionSource = dataclasses.field(default_factory=lambda: MotionSource(frames=20))
+    outfit: Outfit = dataclasses.field(default_factory=Outfit)
+    simulation: SimulationOptions = dataclasses.field(default_factory=SimulationOptions)
+    console: Console = dataclasses.field(default_factory=Console)
 
 
 @dataclasses.dataclass(frozen=True)
 class Inspect:
-    """Look at garment or motion files: what they are, what is wrong, what mends it.
+    """Inspect garment or motion files: properties, problems and how to fix them.
 
     Examples:
       physxnet inspect my_shirt.obj
@@ -89,22 +104,22 @@ class Inspect:
     """Garments (.obj, .glb, .gltf, .usd, .usda, .usdc, .ply, .stl; coat.glb#sleeves is one mesh of
     several) or motions (.bvh, .amc, .npz, .vrma, .glb and .gltf without a mesh, built-in clips)."""
     motion: bool = False
-    """Of a .glb or .gltf that has both look at the animation."""
+    """Inspect the animation of a .glb or .gltf file that also has a mesh."""
     source_fps: float | None = None
-    """True rate of the motion files, where their headers are wrong."""
+    """True frame rate of the motion files, if their headers are wrong."""
     skeleton: pathlib.Path | None = None
-    """The ASF of AMC files."""
+    """The ASF file of AMC files."""
     joint_map: pathlib.Path | None = None
-    """Joint names of the motion files, for unknown ones: TOML lines like Hips = "pelvis"."""
+    """TOML file for unknown joint names of the motion files, with lines like Hips = "pelvis"."""
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Fit:
-    """Make a garment file wearable: on the body, welded, clean, oriented, out of the skin.
+    """Repair a garment file: place, weld, clean and orient it, and clear the skin.
 
     Examples:
       physxnet fit my_shirt.obj -o my_shirt_fitted.obj
@@ -113,49 +128,49 @@ class Fit:
     """
 
     file: tyro.conf.Positional[pathlib.Path]
-    """A garment, as `physxnet inspect` reads it; it isn't changed."""
+    """A garment file that `physxnet inspect` reads; it isn't changed."""
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
     """The OBJ to write: metres, Y up, on the body at rest."""
     like: Literal["top", "bottom", "dress"] | None = None
-    """Turn, scale and move it to where this template is, instead of guessing its unit."""
+    """Rotate, scale and move it to match this template, instead of guessing its unit."""
     edge_length: float | None = None
     """Split edges that are longer than this [mm]."""
     decimate: float | None = None
-    """Before that, make it coarser: edges of about this length [mm]."""
+    """Before edges are split, decimate it to about this edge length [mm]."""
     drape: bool = False
-    """At last let it down onto the body by its weight: for straps that hang in the air."""
+    """Finally settle it on the body under its weight, for straps that don't touch the body."""
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Rest:
-    """Write the body at rest, and templates on it, as OBJ: to model garments on.
+class ExportRest:
+    """Write the body at rest and templates on it as OBJ files, to model garments on.
 
-    Metres, Y up, origin in the pelvis, arms 45 degrees down. A garment modelled on the
-    default shape follows the others; --shape shows what they look like.
+    Units are metres, Y is up, the origin is in the pelvis and the arms are 45 degrees down.
+    A garment modelled on the default shape fits other shapes, too; --shape exports one of them.
 
     Examples:
-      physxnet rest -o rest
-      physxnet rest --wear top dress -o rest
+      physxnet export-rest -o rest
+      physxnet export-rest --wear top dress -o rest
     """
 
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for body.obj and a file for each template."""
     wear: tuple[Literal["top", "bottom", "dress"], ...] = ("top", "bottom", "dress")
-    """Templates to write beside it, as a body of that shape wears them."""
+    """Templates to write as well, fitted to that shape."""
     shape: tuple[str, ...] = ()
     """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,20 +182,20 @@ class Demo:
     """
 
     out: pathlib.Path = pathlib.Path("out")
-    """Folder to write to."""
+    """Output folder."""
     frames: int | None = None
     """Stop after this many frames."""
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Doctor:
-    """Print versions, devices and optional parts; refuse a jaxlib that miscomputes.
+    """Print versions, devices and optional packages; reject a faulty jaxlib.
 
     Examples:
       physxnet doctor
@@ -188,29 +203,29 @@ class Doctor:
     """
 
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibrate:
-    """Time every way to dress on this machine, once; --budget-ms chooses by it.
+    """Time all dressing methods once on this machine; --budget-ms uses the times.
 
-    Times are kept in $XDG_CACHE_HOME or ~/.cache. Stopped, it goes on where it was.
+    Times are stored in $XDG_CACHE_HOME or ~/.cache. An interrupted run resumes where it stopped.
 
     Examples:
       physxnet calibrate
     """
 
     again: bool = False
-    """Forget what was measured before."""
+    """Discard earlier measurements."""
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -223,16 +238,16 @@ class Clips:
     """
 
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class View:
     """Open the viewer in a browser: motions, garments, methods, shapes, errors, maps.
 
-    It listens on this machine alone. Over ssh, forward its port:
+    It accepts connections from this machine only. Over ssh, forward its port:
     ssh -L 8080:localhost:8080 machine
 
     Examples:
@@ -244,55 +259,35 @@ class View:
 
     motion: tyro.conf.Positional[str] = "walk"
     """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
-    wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and garment files."""
     method: Literal["network", "lbs", "simulate"] = "network"
     """network, lbs (skinning alone) or simulate."""
-    weights: str = "local+relax"
-    """Name of network weights, as for dress."""
     compare: bool = False
-    """Simulate the same clothes beside it and colour by the distance."""
+    """Also simulate the same clothes, and colour by the distance between both."""
     live: bool = False
-    """Ask the network for each frame in the moment it is shown, and tell what that takes."""
-    push_out: bool = True
-    """Push vertices that end inside the body onto it."""
+    """Compute each frame when it is shown, and report the time."""
     shape: tuple[str, ...] = ()
     """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
-    accuracy: Literal["draft", "standard", "fine"] = "standard"
-    """What a simulation may cost."""
-    fabric: str | None = None
-    """cotton, denim, silk, wool, jersey or leather for all garments when simulated."""
-    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Steady wind when simulated [m/s]."""
-    self_contact: bool = False
-    """Garments collide with themselves when simulated."""
-    frames: int = 150
-    """Frames at most."""
-    fps: float = 30.0
-    """Frames a second."""
-    source_fps: float | None = None
-    """True rate of the motion file, where its header is wrong or silent."""
-    skeleton: pathlib.Path | None = None
-    """The ASF of an AMC file, if it doesn't lie beside it."""
-    joint_map: pathlib.Path | None = None
-    """Joint names of the motion file, for unknown ones: TOML lines like Hips = "pelvis"."""
+    source: MotionSource = dataclasses.field(default_factory=lambda: MotionSource(frames=150))
+    outfit: Outfit = dataclasses.field(default_factory=Outfit)
+    inference: InferenceOptions = dataclasses.field(default_factory=InferenceOptions)
+    simulation: SimulationOptions = dataclasses.field(default_factory=SimulationOptions)
     html: pathlib.Path | None = None
-    """Write one page that plays by itself, and end."""
+    """Write a self-contained HTML page, and exit."""
     host: str = "127.0.0.1"
-    """Address to listen at; 0.0.0.0 lets every machine of the network in."""
+    """Address to listen on; 0.0.0.0 accepts connections from the whole network."""
     port: int = 8080
-    """Port to listen at; the next free one is taken."""
+    """Port to listen on; the next free one if it is in use."""
     browser: bool = True
     """Open the browser."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Export:
-    """Write clothes as one function that needs no more than jax and flatbuffers.
+    """Export clothes as one function that needs only jax and flatbuffers.
 
     Examples:
       physxnet export --wear top bottom --out out/dresser
@@ -300,19 +295,15 @@ class Export:
 
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the function (StableHLO), triangles, a card and a loader."""
-    wear: tuple[str, ...] = ("top", "bottom")
-    """Garments: files or top, bottom, dress."""
-    weights: str = "local+relax"
-    """Name or folder of network weights, as for dress."""
     fps: float = 30.0
-    """Frames a second that it will be asked for."""
-    push_out: bool = True
-    """Push vertices that end inside the body onto it."""
+    """Frame rate of the function's input motion [1/s]."""
     platforms: tuple[str, ...] = ("cpu", "cuda")
-    """Where it will run."""
+    """Platforms that it will run on."""
+    outfit: Outfit = dataclasses.field(default_factory=Outfit)
+    inference: InferenceOptions = dataclasses.field(default_factory=InferenceOptions)
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""

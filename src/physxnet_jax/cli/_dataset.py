@@ -1,4 +1,4 @@
-"""`physxnet dataset`: build one, or look it over."""
+"""`physxnet dataset`: builds or checks a dataset."""
 
 import dataclasses
 import pathlib
@@ -20,10 +20,10 @@ from ..data import (
     read_sequence,
 )
 from ..errors import FormatError
-from ..evaluation import Finding, check_sequence, network, skinning
-from ..files import check_writable, whole_file
+from ..evaluation import Finding, check_sequence, method_by_name, skinning
+from ..files import atomic_write, check_writable
 from ..garment import TEMPLATES, Template, template
-from ..io import AnimatedMesh, load_predictor
+from ..io import AnimatedMesh
 from ..motion import Motion
 from ..viewer import render_frame
 from ._configs import mocap_folder, read_config
@@ -34,7 +34,7 @@ _TILE = (220, 260)
 
 
 def dataset(command: Dataset, console: Console) -> int:
-    """Builds or checks; 1 if a check finds something."""
+    """Builds or checks a dataset; returns 1 if a check finds a problem."""
     return _build(command, console) if command.what == "build" else _check(command, console)
 
 
@@ -52,13 +52,13 @@ def _build(command: Dataset, console: Console) -> int:
             shard=shard,
             only=command.only,
             report=lambda text, k, n: progress("garments", k, n),
-            ask=_mean_answer(config.networks) if config.networks else None,
+            ask=_mean_prediction(config.networks) if config.networks else None,
         )
     digest, size = dataset_digest(command.out)
     spent = sum(line["seconds"] for line in read_log(command.out))
     console.print(
-        f"{done} garments simulated in {time.perf_counter() - began:.0f} s ({spent:.0f} s for all"
-        f" that is there); {size / 1e6:.1f} MB, sha256 {digest}",
+        f"{done} garments simulated in {time.perf_counter() - began:.0f} s ({spent:.0f} s for the"
+        f" whole dataset); {size / 1e6:.1f} MB, sha256 {digest}",
         highlight=False,
     )
     if command.json:
@@ -66,11 +66,11 @@ def _build(command: Dataset, console: Console) -> int:
     return 0
 
 
-def _mean_answer(names: tuple[str, ...]) -> Callable[[Motion, Template], np.ndarray]:
-    asked = [network(load_predictor(name)) for name in names]
+def _mean_prediction(names: tuple[str, ...]) -> Callable[[Motion, Template], np.ndarray]:
+    methods = [method_by_name(name) for name in names]
 
     def ask(motion: Motion, name: Template) -> np.ndarray:
-        return np.mean([method(motion, name).positions for method in asked], axis=0)
+        return np.mean([method(motion, name).positions for method in methods], axis=0)
 
     return ask
 
@@ -86,12 +86,12 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def _check(command: Dataset, console: Console) -> int:
-    if command.sheet is not None:
-        check_writable(command.sheet)
+    if command.contact_sheet is not None:
+        check_writable(command.contact_sheet)
     root = pathlib.Path(command.target)
     folders = list_sequences(root)
     if not folders:
-        raise FormatError(f"{root}: no actions in there.")
+        raise FormatError(f"{root}: no actions found.")
     folder = mocap_folder(command.mocap)
     counts = expected_frames(root, folder) if folder.is_dir() else {}
     found: list[Finding] = []
@@ -101,7 +101,7 @@ def _check(command: Dataset, console: Console) -> int:
             progress("actions", k, len(folders))
             sequence = read_sequence(path)
             found += check_sequence(sequence, counts.get(sequence.name))
-            if command.sheet is not None:
+            if command.contact_sheet is not None:
                 pictures.append(_picture(sequence))
     digest, size = dataset_digest(root)
     bad = [f for f in found if not f.holds]
@@ -116,12 +116,12 @@ def _check(command: Dataset, console: Console) -> int:
         print_json(
             {"sha256": digest, "bytes": size, "rows": [dataclasses.asdict(f) for f in found]}
         )
-    if command.sheet is not None:
+    if command.contact_sheet is not None:
         import imageio.v3 as iio
 
-        with whole_file(command.sheet) as part:
+        with atomic_write(command.contact_sheet) as part:
             iio.imwrite(part, contact_sheet(pictures), extension=".png")
-        console.print(f"wrote {command.sheet}", highlight=False)
+        console.print(f"wrote {command.contact_sheet}", highlight=False)
     return 1 if bad else 0
 
 
@@ -139,7 +139,7 @@ def _picture(sequence: Sequence) -> np.ndarray:
 
 
 def contact_sheet(pictures: list[np.ndarray], columns: int = 3) -> np.ndarray:
-    """Pictures of one height in rows; white where there is none."""
+    """Arranges images of equal height in rows; the rest is white."""
     width = max(p.shape[1] for p in pictures)
     rows = []
     for k in range(0, len(pictures), columns):

@@ -1,4 +1,4 @@
-"""`physxnet doctor`: the first thing a bug report asks for."""
+"""`physxnet doctor`: versions and devices, for bug reports."""
 
 import importlib.metadata
 import os
@@ -11,6 +11,7 @@ from rich.text import Text
 
 from .._environment import jaxlib_problem
 from .._version import __version__
+from ._commands import Doctor
 from ._progress import print_json
 
 _REQUIRED = ("jax", "jaxlib", "flax", "optax", "orbax-checkpoint", "numpy", "scipy", "trimesh")
@@ -18,7 +19,7 @@ _OPTIONAL = {
     "usd-core": "usd: writes .usdc",
     "pygltflib": "gltf: writes .glb and .html",
     "fast-simplification": "mesh: decimates garments",
-    "pyvista": "render: pictures and videos",
+    "pyvista": "render: images and videos",
     "imageio-ffmpeg": "render: .mp4",
     "viser": "viewer: in the browser",
 }
@@ -28,7 +29,7 @@ _MISSING = "missing"
 
 
 def doctor(console: Console, *, json: bool = False) -> int:
-    """Prints versions, devices and optional parts; 1 if jaxlib can't be trusted."""
+    """Prints versions, devices and optional packages; returns 1 if it finds a problem."""
     rows = [("python", f"{platform.python_version()} ({sys.platform}, {platform.machine()})")]
     rows += [(name, _version(name) or _MISSING) for name in _REQUIRED]
     rows += [(n, _version(n) or f"not installed (extra {use})") for n, use in _OPTIONAL.items()]
@@ -41,7 +42,7 @@ def doctor(console: Console, *, json: bool = False) -> int:
 
         for device in jax.devices():
             rows.append(("device", f"{device.platform}: {device.device_kind}"))
-        from ..io import list_weights
+        from ..models import list_weights
 
         rows.append(("weights", ", ".join(list_weights()) or "none"))
     if json:
@@ -65,3 +66,8 @@ def _version(name: str) -> str | None:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return None
+
+
+def run_doctor(command: Doctor, console: Console) -> int:
+    """Prints what is installed; returns 1 if a required package is missing or broken."""
+    return doctor(console, json=command.json)

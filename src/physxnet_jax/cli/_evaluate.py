@@ -10,59 +10,59 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from ..data import Sequence, dataset_digest, list_sequences, read_sequence
-from ..dressing import method_by_name, weights_folder
+from ..data import Sequence, dataset_digest, list_sequences, read_sequence, usable_garment
+from ..dressing import EXTERNAL_ENGINES
 from ..errors import FormatError, PhysXNetError
 from ..evaluation import (
     DIGITS,
-    ENGINES,
     ActionError,
     Method,
     error_tables,
     evaluate as measure,
     means,
+    method_by_name,
     nearest_frame,
+    parse_method,
     pose_network,
     retime,
     summary_table,
     training_frames,
 )
-from ..files import whole_file, write_json
-from ..io import load_predictor
-from ..simulation import ACCURACY
-from ..training import usable_garment
+from ..files import atomic_write, write_json
+from ..models import load_predictor
+from ..simulation import PRESETS
 from ..viewer import draw_bars
 from ._experiment_commands import Evaluate
 from ._progress import print_json, progress_bars
 from ._rows import check_rows_file, kept_rows, weights_digest
 
 # Baselines that learn from a dataset.
-_LEARNED = ("nearest", "mlp")
+_TRAINED_BASELINES = ("nearest", "mlp")
 
 
 def evaluate(command: Evaluate, console: Console) -> int:
-    """Measures row by row; each is kept as soon as it is there."""
+    """Measures row by row, and saves each as soon as it is complete."""
     check_rows_file(command.out)
     folders = list_sequences(command.data, command.split)
     if not folders:
         raise FormatError(f"{command.data}: no '{command.split}' actions; build a dataset first.")
     twice = [n for n, k in collections.Counter(map(_label, command.methods)).items() if k > 1]
     if twice:
-        raise PhysXNetError(f"two methods are called {twice[0]}; rename a run's folder.")
+        raise PhysXNetError(f"two methods are named {twice[0]}; rename a run's folder.")
     rows = _read(command.out)
     if command.times and not {r.method for r in rows} & set(map(_label, command.methods)):
-        raise PhysXNetError("--times measures rows of --out again, and there are none of these.")
+        raise PhysXNetError("--times measures rows of --out again; these methods have none.")
     sequences = [read_sequence(f) for f in folders]
     digests = {_label(name): _digest(name, command) for name in command.methods}
     _check_rows(rows, digests, sequences, command.out)
     with progress_bars(console) as progress:
-        # What has all its rows needn't be at hand.
-        wanted = [
+        # A method whose rows are complete isn't loaded.
+        needed = [
             name
             for name in command.methods
-            if command.times or not _measured(_label(name), sequences, command, rows)
+            if command.times or not _is_measured(_label(name), sequences, command, rows)
         ]
-        methods = {_label(name): _method(name, command, progress) for name in wanted}
+        methods = {_label(name): _method(name, command, progress) for name in needed}
 
         def show(_: str, k: int, n: int) -> None:
             progress("rows", k, n)
@@ -81,10 +81,10 @@ def evaluate(command: Evaluate, console: Console) -> int:
     for engine in dict.fromkeys(r.engine for r in rows):
         console.print(_summary(rows, engine))
     if command.out is not None:
-        with whole_file(command.out.with_suffix(".md")) as part:
+        with atomic_write(command.out.with_suffix(".md")) as part:
             part.write_text(summary_table(rows) + "\n" + error_tables(rows))
         stem = command.out.with_suffix("")
-        # What was only pushed out or asked twice is hardly told apart from bars of its own.
+        # Variants of a network are hardly distinguishable as separate bars.
         known = {r.method for r in rows}
         drawn = [r for r in rows if r.method.partition("+")[0] not in known - {r.method}]
         for what in ("vertices", "texels"):
@@ -102,10 +102,10 @@ def evaluate(command: Evaluate, console: Console) -> int:
 def _digest(name: str, command: Evaluate) -> str:
     """The checksum of a network's weights, or of the dataset that a baseline learns from.
 
-    Nothing for what is none, or isn't at hand.
+    Empty for other methods, and if the weights or the dataset are missing.
     """
-    if name in _LEARNED:
-        root = command.learn_from or command.data
+    if name in _TRAINED_BASELINES:
+        root = command.train_data or command.data
         return dataset_digest(root)[0][:DIGITS] if list_sequences(root) else ""
     return weights_digest(name)
 
@@ -116,10 +116,10 @@ def _check_rows(
     sequences: Items[Sequence],
     out: pathlib.Path | None,
 ) -> None:
-    """Fails where a row was measured with other weights, or against another simulation.
+    """Raises if a row was measured with other weights or against another simulation.
 
-    What wasn't noted isn't compared, nor is what a baseline learned from where another
-    engine is the reference: each may have a training set of its own.
+    Checksums that weren't recorded aren't compared. Training sets of baselines aren't compared
+    for rows of another reference engine, because each engine may have its own training set.
     """
     data = {
         (s.meta[t]["engine"], s.name, t): str(s.meta[t].get("sha256", ""))[:DIGITS]
@@ -128,9 +128,9 @@ def _check_rows(
     }
     engines = {engine for engine, _, _ in data}
     for r in rows:
-        elsewhere = r.method in _LEARNED and r.engine not in engines
+        other_engine = r.method in _TRAINED_BASELINES and r.engine not in engines
         pairs = (
-            ("weights", r.weights, "" if elsewhere else digests.get(r.method, "")),
+            ("weights", r.weights, "" if other_engine else digests.get(r.method, "")),
             ("simulation", r.data, data.get((r.engine, r.action, r.template), "")),
         )
         for what, then, now in pairs:
@@ -142,10 +142,10 @@ def _check_rows(
                 )
 
 
-def _measured(
+def _is_measured(
     label: str, sequences: Items[Sequence], command: Evaluate, rows: Items[ActionError]
 ) -> bool:
-    """Whether every row that a method could have is there."""
+    """Whether all rows that a method can have are measured."""
     known = {(r.engine, r.action, r.template) for r in rows if r.method == label}
     return all(
         (s.meta[t]["engine"], s.name, t) in known
@@ -173,7 +173,7 @@ def _write(path: pathlib.Path, rows: list[ActionError]) -> None:
 
 
 def _rounded(row: ActionError) -> Mapping[str, object]:
-    # What earlier versions didn't measure is left out: NaN is no JSON.
+    # Values that earlier versions didn't measure are omitted: JSON has no NaN.
     optional = {f.name for f in dataclasses.fields(row) if f.default is not dataclasses.MISSING}
     return {
         k: float(f"{v:.5g}") if isinstance(v, float) else v
@@ -183,24 +183,24 @@ def _rounded(row: ActionError) -> Mapping[str, object]:
 
 
 def _label(name: str) -> str:
-    """A run is called as its folder is, wherever that lies."""
+    """The name of a method; a run has the name of its folder, without the path."""
     return pathlib.Path(name).name
 
 
 def _method(name: str, command: Evaluate, progress: Callable[[str, int, int], None]) -> Method:
-    if name in _LEARNED:
-        root = command.learn_from or command.data
+    if name in _TRAINED_BASELINES:
+        root = command.train_data or command.data
         known = training_frames(
             [read_sequence(f) for f in list_sequences(root, "train")], command.templates
         )
         return nearest_frame(known) if name == "nearest" else pose_network(known, report=progress)
-    if name not in ("lbs", "noise", *ACCURACY, *ENGINES):
-        # Before minutes are spent on other methods.
-        predictor = load_predictor(weights_folder(name.removesuffix("+push")))
+    if name not in ("lbs", "perturbed", *PRESETS, *EXTERNAL_ENGINES):
+        # Checked before other methods are measured, which takes minutes.
+        predictor = load_predictor(str(parse_method(name).weights))
         missing = set(command.templates) - set(predictor.config.templates)
         if missing:
             raise PhysXNetError(
-                f"{name} has no decoder for {', '.join(sorted(missing))}; name --templates it has."
+                f"{name} has no decoder for {', '.join(sorted(missing))}; use --templates it has."
             )
     return method_by_name(name)
 

@@ -9,7 +9,7 @@ import tyro
 
 @dataclasses.dataclass(frozen=True)
 class Stress:
-    """Run the simulator's hard cases: what is measured, its bound, whether it holds.
+    """Run the simulator's hard cases and check each measurement against its bound.
 
     Examples:
       physxnet stress
@@ -18,22 +18,22 @@ class Stress:
     """
 
     cases: tuple[str, ...] = ()
-    """Names of cases; all of them if none is given."""
+    """Names of cases; all by default."""
     peers: tuple[Literal["blender", "newton"], ...] = ()
     """Other simulators that run the cases they can (PHYSXNET_BLENDER, PHYSXNET_NEWTON)."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Write the rows to this file, as JSON."""
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Bench:
-    """What accuracy costs in time: solvers and settings, or networks and their sizes.
+    """Measure accuracy against time of solvers and settings, or of networks.
 
     Examples:
       physxnet bench net --weights nano small local --data runs/ours --out out/net.json
@@ -48,138 +48,140 @@ class Bench:
     weights: tuple[str, ...] = ("local",)
     """net: names or folders of weights, or runs."""
     data: pathlib.Path | None = None
-    """net: a dataset whose test actions give the errors; times alone without one."""
+    """net: a dataset whose test actions give the errors; without one, only times are measured."""
     errors: pathlib.Path | None = None
-    """net: rows of `physxnet evaluate` against that dataset; what is there isn't measured again,
-    and rows of --out take their errors from it."""
-    simulator: tuple[Literal["draft", "standard", "fine", "noise", "blender", "newton"], ...] = ()
-    """net: accuracies of the simulator to run as well; noise is standard with jitter.
-    blender, newton: their times alone, for they model another cloth."""
+    """net: rows of `physxnet evaluate` against that dataset; their errors aren't measured again,
+    and replace those of rows in --out."""
+    simulator: tuple[
+        Literal["draft", "standard", "fine", "perturbed", "blender", "newton"], ...
+    ] = ()
+    """net: accuracies of the simulator to run as well; perturbed is standard with a perturbed
+    root. blender, newton: times only, because they model another cloth."""
     precisions: tuple[Literal["float32", "bfloat16"], ...] = ("float32",)
-    """net: what the networks' arithmetic is done in."""
+    """net: precisions of the networks' arithmetic."""
     backward: bool = False
     """net: measure gradients as well."""
     times: bool = False
-    """net: measure the times of these methods' rows again, and nothing else."""
+    """net: only measure the times of these methods' rows again."""
     batches: tuple[int, ...] = (1, 32)
-    """net: frames a call."""
+    """net: frames per call."""
     garments: tuple[int, ...] = (1, 2, 3)
-    """net: how many garments are worn."""
+    """net: numbers of garments."""
     scenes: tuple[Literal["sheet", "skirt", "shirt"], ...] = ("sheet", "skirt", "shirt")
-    """A hanging sheet, a dress on a spin, a shirt on a punch."""
+    """sim: a hanging sheet, a dress on a spin, a shirt on a punch."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Rows as JSON, with a table (.md) and a diagram (.png) beside it; goes on from there."""
+    """Rows as JSON, with a table (.md) and a diagram (.png) next to it; existing rows are kept."""
     frames: int = 20
-    """Frames of the scenes with a body."""
+    """sim: frames of the scenes with a body."""
     shirt: pathlib.Path | None = None
-    """An OBJ file instead of the template top."""
+    """sim: an OBJ file instead of the template top."""
     motion: str = "punch"
-    """What the person in the shirt does: a motion file or a built-in clip."""
+    """sim: the motion of scene shirt, a motion file or a built-in clip."""
     blender: tuple[int, ...] = ()
-    """Qualities at which Blender runs too, the finest last."""
+    """sim: quality settings to run Blender with as well, the finest last."""
     newton: tuple[int, ...] = ()
-    """Substeps at which Newton runs too, likewise."""
+    """sim: substeps to run Newton with as well, the finest last."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Dataset:
-    """Build a dataset of simulated clothes from motion files, or look it over.
+    """Build a dataset of simulated clothes from motion files, or check one.
 
-    Stopped, the same command goes on where it was; shards may run side by side.
+    An interrupted build resumes if the same command is run again. Shards can run in parallel.
 
     Examples:
-      physxnet dataset build experiments/configs/dataset_physxnet.py --out runs/ours
-      physxnet dataset build experiments/configs/dataset_blender.py --out runs/b --shard 1/4
-      physxnet dataset check runs/ours --sheet out/ours.png
+      physxnet dataset build experiments/datasets.toml#ours --out runs/ours
+      physxnet dataset build experiments/datasets.toml#blender --out runs/b --shard 1/4
+      physxnet dataset check runs/ours --contact-sheet out/ours.png
     """
 
     what: tyro.conf.Positional[Literal["build", "check"]]
     """build: simulate. check: look for explosions, penetration, jitter, wrong counts."""
     target: tyro.conf.Positional[str]
-    """build: a configuration, a Python file with CONFIG. check: a dataset's folder."""
+    """build: a configuration, FILE.toml or FILE.toml#TABLE. check: a dataset's folder."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """build: the dataset's folder."""
     mocap: pathlib.Path | None = None
-    """Where ACTIONS.csv and the motion files lie; mocap in $PHYSXNET_DATA or ../shared.
-    docs/protocol.md tells what is in it."""
+    """Folder of ACTIONS.csv and the motion files; by default mocap in $PHYSXNET_DATA or ../shared.
+    docs/protocol.md describes its contents."""
     shard: str = "0/1"
     """build: i/n, every n-th action from the i-th."""
     only: tuple[str, ...] = ()
-    """build: names of actions."""
-    sheet: pathlib.Path | None = None
+    """build: names of the actions to build; all by default."""
+    contact_sheet: pathlib.Path | None = None
     """check: a contact sheet, .png."""
     json: bool = False
-    """Print JSON: of check all findings instead of those out of bounds as a table, of build
-    its checksum, size and time."""
+    """Print JSON. check: all findings, instead of a table of those out of bounds. build: checksum,
+    size and time."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Train:
     """Train a network on a dataset.
 
-    Stopped, the same command goes on where it was.
+    An interrupted run resumes if the same command is run again.
 
     Examples:
-      physxnet train experiments/configs/local_cpu.py --data runs/ours --out runs/local
+      physxnet train experiments/training.toml#local --data runs/ours --out runs/local
     """
 
     config: tyro.conf.Positional[str]
-    """A Python file with CONFIG, a TrainConfig."""
+    """A TrainConfig: FILE.toml or FILE.toml#TABLE."""
     data: tyro.conf.UseAppendAction[tuple[pathlib.Path, ...]]
     """Folders of datasets."""
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
     """The run's folder: checkpoints, metrics.jsonl, TensorBoard events, weights."""
     splits: tuple[str, ...] = ("train",)
-    """Parts of the datasets that are learned from."""
+    """Splits of the datasets to train on."""
     steps: int | None = None
-    """Stop after this many steps in all."""
+    """Stop after this many steps in total."""
     name: str | None = None
-    """Name of the weights; the configuration's file name."""
+    """Name of the weights; by default the configuration's table or file name."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Evaluate:
-    """The error of methods on every action of a dataset, beside what each costs.
+    """Measure the error and the cost of methods on every action of a dataset.
 
-    Methods: lbs, nearest, mlp, draft, standard, fine, noise, names of weights, folders of
-    weights or of runs; blender and newton, which model another cloth. With +push after a
-    network's name its vertices are pushed out of the body.
+    Methods: lbs, nearest, mlp, draft, standard, fine, perturbed, names of weights, folders of
+    weights or of runs; blender and newton, which model another cloth. +push after a network's
+    name enables collision resolution.
 
     Examples:
       physxnet evaluate local local+push lbs --data runs/ours --out out/errors.json
-      physxnet evaluate lbs nearest mlp draft noise --data runs/ours --split test
+      physxnet evaluate lbs nearest mlp draft perturbed --data runs/ours --split test
     """
 
     methods: tyro.conf.Positional[tuple[str, ...]]
-    """What is measured."""
+    """Methods to measure."""
     data: pathlib.Path
-    """A dataset's folder: what is measured against."""
+    """Folder of the reference dataset."""
     split: str = "test"
     """train, test or extra."""
-    learn_from: pathlib.Path | None = None
-    """Dataset that nearest and mlp learn from; the same one."""
+    train_data: pathlib.Path | None = None
+    """Dataset that nearest and mlp learn from; --data by default."""
     templates: tuple[Literal["top", "bottom", "dress"], ...] = ("top", "bottom", "dress")
-    """Garments."""
+    """Garments to measure."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """Rows as JSON; tables (.md) and two charts (_vertices.png, _texels.png) beside it.
-    Rows that are there already are kept."""
+    """Rows as JSON, with tables (.md) and two charts (_vertices.png, _texels.png) next to it.
+    Existing rows are kept."""
     times: bool = False
-    """Measure the times of these methods' rows again, in one go, and nothing else."""
+    """Only measure the times of these methods' rows again, in one run."""
     json: bool = False
-    """Print JSON for machines instead of tables."""
+    """Print JSON instead of tables."""
     quiet: bool = False
-    """Print nothing but errors."""
+    """Print errors only."""
     debug: bool = False
-    """Show the trace of an error."""
+    """Show the traceback of an error."""

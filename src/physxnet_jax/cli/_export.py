@@ -1,4 +1,4 @@
-"""`physxnet export`: clothes as one function that needs jax alone."""
+"""`physxnet export`: clothes as one function, without this package."""
 
 from rich.console import Console
 
@@ -8,15 +8,15 @@ from ._progress import print_json
 
 
 def export(command: Export, console: Console) -> int:
-    """Writes the function and says how to call it."""
+    """Writes the function and prints how to call it."""
     with console.status("binding and lowering"):
-        dresser = make_dresser(command.wear, weights=command.weights, push_out=command.push_out)
+        dresser = make_dresser(command.outfit.words, inference=command.inference.build())
         files = export_dresser(
             command.out,
             dresser,
             fps=command.fps,
             platforms=command.platforms,
-            name=command.weights,
+            name=str(command.inference.weights),
         )
     if command.json:
         print_json({"files": files, "notes": dresser.notes})
@@ -26,7 +26,7 @@ def export(command: Export, console: Console) -> int:
     for file in files:
         console.print(f"wrote {file} ({file.stat().st_size / 1e6:.1f} MB)", highlight=False)
     console.print(
-        f"use, in {command.out}: from dress import load; cloth, ok = load('.')(rotations, root)",
+        f"usage, in {command.out}: from dress import load; cloth, ok = load('.')(rotations, root)",
         highlight=False,
     )
     return 0

@@ -1,4 +1,4 @@
-"""`physxnet inspect` and `physxnet fit`: files of garments and motions, looked at and mended."""
+"""`physxnet inspect`, `fit` and `export-rest`: garment and motion files."""
 
 import dataclasses
 import math
@@ -6,51 +6,54 @@ import pathlib
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array, Float
 from rich.console import Console
 from rich.table import Table
 
 from ..body import load_body
+from ..dressing import Inspection, fit_garment, inspect_garment
 from ..errors import MeshError
 from ..garment import template
-from ..io import Inspection, fit_garment, inspect_garment, write_obj
-from ..motion import CLIPS, GltfFile, MotionInspection, inspect_motion
-from ._commands import Fit, Inspect, Rest
+from ..io import GltfFile, write_obj
+from ..motion import CLIPS, MotionInspection, inspect_motion
+from ._commands import ExportRest, Fit, Inspect
 from ._progress import print_json, progress_bars
+from ._shape import parse_shape
 
-# What holds motion alone.
-_MOTIONS = (".bvh", ".amc", ".npz", ".vrma")
+# Formats that contain only motion.
+_MOTION_SUFFIXES = (".bvh", ".amc", ".npz", ".vrma")
 
 
 def inspect(command: Inspect, console: Console) -> int:
-    """Shows every file; 1 if one of them needs mending."""
+    """Inspects files; returns 1 if one of them has problems."""
     if not command.files:
-        raise MeshError("no file to look at: name one, as in `physxnet inspect my_shirt.obj`.")
-    of_motion = {
+        raise MeshError("no file to inspect: name one, as in `physxnet inspect my_shirt.obj`.")
+    motion_options = {
         "source_fps": command.source_fps,
         "skeleton": command.skeleton,
         "joint_map": command.joint_map,
     }
-    told = [f"--{k.replace('_', '-')}" for k, v in of_motion.items() if v is not None]
+    given = [f"--{k.replace('_', '-')}" for k, v in motion_options.items() if v is not None]
     found: list[Inspection | MotionInspection] = []
     for file in command.files:
         if command.motion or _is_motion(file):
-            found.append(inspect_motion(file, **of_motion))
-        elif told:
-            raise MeshError(f"{told[0]} is for motions; {file} is a garment. Look at it apart.")
+            found.append(inspect_motion(file, **motion_options))
+        elif given:
+            raise MeshError(
+                f"{given[0]} is for motions; {file} is a garment. Inspect it separately."
+            )
         else:
             found.append(inspect_garment(file))
         if not command.json:
             _show(found[-1], console)
     if command.json:
-        print_json([_plain(f) for f in found])
+        print_json([_to_json(f) for f in found])
     return int(any(f.problems for f in found))
 
 
 def _is_motion(file: pathlib.Path) -> bool:
-    """Whether a file holds motion and no mesh."""
+    """Whether a file contains motion and no mesh."""
     suffix = file.suffix.lower()
-    if suffix in _MOTIONS or str(file) in CLIPS:
+    if suffix in _MOTION_SUFFIXES or str(file) in CLIPS:
         return True
     if suffix not in (".glb", ".gltf") or not file.is_file():
         return False
@@ -59,7 +62,7 @@ def _is_motion(file: pathlib.Path) -> bool:
 
 
 def fit(command: Fit, console: Console) -> int:
-    """Mends a file; says what was done and how the result looks."""
+    """Repairs a file; reports the steps and the inspection of the result."""
     longest, coarser = (
         None if mm is None else 1e-3 * mm for mm in (command.edge_length, command.decimate)
     )
@@ -73,10 +76,10 @@ def fit(command: Fit, console: Console) -> int:
             edge_length=longest,
             coarser=coarser,
             draped=command.drape,
-            progress=lambda k, n: bars("letting it down", k, n),
+            progress=lambda k, n: bars("settling", k, n),
         )
     if command.json:
-        print_json({"done": done, "result": _plain(result), "files": [command.out]})
+        print_json({"done": done, "result": _to_json(result), "files": [command.out]})
         return int(bool(result.problems))
     for step in done:
         console.print(step, highlight=False)
@@ -85,9 +88,10 @@ def fit(command: Fit, console: Console) -> int:
     return int(bool(result.problems))
 
 
-def rest(command: Rest, shape: Float[Array, " shapes"], console: Console) -> int:
-    """Writes the body of that shape, and templates as it wears them, at rest."""
+def export_rest(command: ExportRest, console: Console) -> int:
+    """Writes a body of a given shape and templates fitted to it, at rest."""
     body, files = load_body(), []
+    shape = body.shape(**parse_shape(command.shape))
     meshes = {"body": body.rest_mesh(shape)}
     for name in command.wear:
         garment = template(name)
@@ -107,7 +111,7 @@ def rest(command: Rest, shape: Float[Array, " shapes"], console: Console) -> int
 
 
 def _show(found: Inspection | MotionInspection, console: Console) -> None:
-    rows = _of_garment(found) if isinstance(found, Inspection) else _of_motion(found)
+    rows = _garment_rows(found) if isinstance(found, Inspection) else _motion_rows(found)
     table = Table(title=str(found.path), title_justify="left", show_header=False)
     for name, value in rows:
         table.add_row(name, value)
@@ -119,21 +123,21 @@ def _show(found: Inspection | MotionInspection, console: Console) -> None:
     console.print(found.verdict, highlight=False, markup=False, soft_wrap=True)
 
 
-def _of_motion(found: MotionInspection) -> list[tuple[str, str]]:
+def _motion_rows(found: MotionInspection) -> list[tuple[str, str]]:
     return [
         ("frames", f"{found.frames:,} at {found.fps:g} a second: {found.seconds:.2f} s"),
-        ("names of joints", found.skeleton),
-        ("joints", f"{found.joints}, {found.carried} of the body's follow them"),
-        ("turns from", found.reference),
-        ("unit", found.unit or "none of the usual ones; it doesn't matter"),
-        ("way of the hips", f"{found.travelled:.1f} m, at up to {found.fastest:.1f} m/s"),
-        ("lower foot", f"{100 * found.feet:.1f} cm above the floor, in the median"),
+        ("joint names", found.skeleton),
+        ("joints", f"{found.joints}, followed by {found.carried} joints of the body"),
+        ("reference pose", found.reference),
+        ("unit", found.unit or "not a usual one; motions don't need it"),
+        ("path of the hips", f"{found.travelled:.1f} m, at up to {found.fastest:.1f} m/s"),
+        ("lower foot", f"{100 * found.feet:.1f} cm above the floor (median)"),
     ]
 
 
-def _of_garment(found: Inspection) -> list[tuple[str, str]]:
+def _garment_rows(found: Inspection) -> list[tuple[str, str]]:
     h = found.health
-    unit = "of its own" if found.unit is None else found.unit
+    unit = "unknown unit" if found.unit is None else found.unit
     rows: list[tuple[str, str]] = [
         ("size", " x ".join(f"{s:.4g}" for s in found.size) + f" ({unit})"),
         ("up axis", found.up or "unknown"),
@@ -144,19 +148,19 @@ def _of_garment(found: Inspection) -> list[tuple[str, str]]:
     if found.unit is not None:
         around = ", ".join(f"{x:.2f}" for x in h.openings[:6])
         rows += [
-            ("openings", f"{len(h.openings)}: {around} m round" if h.openings else "none"),
+            ("openings", f"{len(h.openings)}: {around} m around" if h.openings else "none"),
             ("edges", f"{1e3 * h.median_edge:.1f} mm, up to {1e3 * h.longest_edge:.0f} mm"),
             ("above the skin", f"{1e3 * found.distance:.0f} mm, up to {1e3 * found.farthest:.0f}"),
-            ("its top", f"{1e3 * found.hangs:.0f} mm off the skin"),
+            ("gap at its top", f"{1e3 * found.hangs:.0f} mm to the skin"),
             ("inside the body", f"{100 * found.inside:.1f} %"),
             ("facing outwards", f"{100 * found.outward:.0f} %"),
-            ("dressed by", found.template or "-"),
-            ("apart from", ", ".join(f"{t} {1e3 * d:.0f} mm" for t, d in found.apart.items())),
-            ("rays that bind it", f"{100 * found.hit_rate:.1f} %"),
+            ("template", found.template or "-"),
+            ("distance from", ", ".join(f"{t} {1e3 * d:.0f} mm" for t, d in found.apart.items())),
+            ("rays that hit the body", f"{100 * found.hit_rate:.1f} %"),
         ]
     return rows
 
 
-def _plain(found: Inspection | MotionInspection) -> dict[str, Any]:
+def _to_json(found: Inspection | MotionInspection) -> dict[str, Any]:
     values = dataclasses.asdict(found) | {"path": str(found.path), "verdict": found.verdict}
     return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}

@@ -1,4 +1,4 @@
-"""What times were measured on."""
+"""Identifies the machine that times are measured on."""
 
 import os
 import platform
@@ -10,7 +10,7 @@ from .._environment import processor_name
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores, device and version, as they stand in result files."""
+    """Processor, cores, device and JAX version, as recorded in result files."""
     return {
         "cpu": processor_name(),
         "cores": os.cpu_count(),
@@ -19,8 +19,8 @@ def machine() -> dict[str, Any]:
     }
 
 
-def same_machine(there: dict[str, Any]) -> bool:
-    """Whether this one is noted, as far as is told: the processor's name wasn't always."""
+def same_machine(recorded: dict[str, Any]) -> bool:
+    """Whether a row's machine is this one; older rows record only the architecture."""
     here = machine()
     known = (here["cpu"], platform.machine())
-    return there.get("cpu") in known and {**there, "cpu": here["cpu"]} == here
+    return recorded.get("cpu") in known and {**recorded, "cpu": here["cpu"]} == here

@@ -1,4 +1,4 @@
-"""What a terminal shows: progress bars with the time left; and what machines read."""
+"""Output: progress bars with the remaining time, and JSON."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -9,12 +9,12 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemaining
 from ..files import json_text
 
 UNWRITTEN = "nothing will be written: name a file with -o or --preview"
-"""Said before the work, where it would be lost."""
+"""Printed before the computation if its result would be lost."""
 
 
 @contextlib.contextmanager
 def progress_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """A function that takes a stage, what is done of it and how much there is."""
+    """Yields a function that takes a stage, the steps done and the number of steps."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -35,5 +35,5 @@ def progress_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]
 
 
 def print_json(values: object) -> None:
-    """One JSON text, whatever the width of the terminal."""
+    """Prints JSON without wrapping it to the width of the terminal."""
     print(json_text(values))  # noqa: T201

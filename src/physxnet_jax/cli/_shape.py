@@ -1,4 +1,4 @@
-"""Shape parameters as they are told on a command line."""
+"""Parses shape parameters of the command line."""
 
 from collections.abc import Sequence
 
@@ -6,13 +6,13 @@ from ..errors import PhysXNetError
 
 
 def parse_shape(words: Sequence[str]) -> dict[str, float]:
-    """Parameters by name.
+    """Parses shape parameters into a dictionary by name.
 
     Args:
-        words: Each ``name=number``.
+        words: Arguments of the form ``name=number``.
 
     Raises:
-        PhysXNetError: A word is something else.
+        PhysXNetError: An argument has another form.
     """
     out = {}
     for word in words:

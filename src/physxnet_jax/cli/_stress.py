@@ -7,15 +7,16 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from ..dressing import EXTERNAL_ENGINES
 from ..errors import PhysXNetError
-from ..evaluation import CASES, ENGINES, PEER_CASES, Finding, run_case, run_peer
+from ..evaluation import CASES, PEER_CASES, Finding, run_case, run_peer
 from ..files import check_writable, write_json
 from ._experiment_commands import Stress
 from ._progress import print_json
 
 
 def stress(command: Stress, console: Console) -> int:
-    """Runs the cases; 0 if every bound holds, else 1."""
+    """Runs the cases; returns 0 if every bound holds, else 1."""
     if command.out is not None:
         check_writable(command.out)
     unknown = [c for c in command.cases if c not in CASES]
@@ -23,15 +24,15 @@ def stress(command: Stress, console: Console) -> int:
         raise PhysXNetError(f"No case {', '.join(unknown)}; there are {', '.join(CASES)}.")
     names = command.cases or tuple(CASES)
     rows: list[Finding] = []
-    others: dict[tuple[str, str], dict[str, float]] = {}
+    peer_results: dict[tuple[str, str], dict[str, float]] = {}
     with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task("hard cases", total=len(names))
         for name in names:
             rows += run_case(name)
             if name in PEER_CASES:
                 for peer in command.peers:
-                    others[peer, name] = run_peer(name, ENGINES[peer])
-            # Every case compiles its own programs; kept, they would fill the memory.
+                    peer_results[peer, name] = run_peer(name, EXTERNAL_ENGINES[peer])
+            # Every case compiles its own programs; cached, they would fill the memory.
             jax.clear_caches()
             bar.advance(task)
     table = Table(title=f"{sum(r.holds for r in rows)} of {len(rows)} bounds hold")
@@ -39,15 +40,15 @@ def stress(command: Stress, console: Console) -> int:
         left = column in ("case", "quantity", "holds")
         table.add_column(column, justify="left" if left else "right")
 
-    def beside(r: Finding) -> dict[str, float]:
+    def peer_row(r: Finding) -> dict[str, float]:
         return {
-            p: others[p, r.case][r.quantity]
+            p: peer_results[p, r.case][r.quantity]
             for p in command.peers
-            if r.quantity in others.get((p, r.case), {})
+            if r.quantity in peer_results.get((p, r.case), {})
         }
 
     for r in rows:
-        theirs = beside(r)
+        theirs = peer_row(r)
         table.add_row(
             r.case,
             r.quantity,
@@ -58,10 +59,10 @@ def stress(command: Stress, console: Console) -> int:
         )
     console.print(table)
     for p in command.peers:
-        tried = [(r, beside(r)[p]) for r in rows if p in beside(r)]
+        tried = [(r, peer_row(r)[p]) for r in rows if p in peer_row(r)]
         held = sum(value <= r.bound for r, value in tried)
         console.print(f"{p}: {held} of {len(tried)} bounds hold", highlight=False)
-    data = [{**dataclasses.asdict(r), "holds": r.holds, **beside(r)} for r in rows]
+    data = [{**dataclasses.asdict(r), "holds": r.holds, **peer_row(r)} for r in rows]
     if command.out is not None:
         write_json(command.out, data)
     if command.json:

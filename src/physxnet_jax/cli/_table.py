@@ -1,26 +1,28 @@
-"""The closing table of a dressed clip."""
+"""Tables that summarise a dressed clip or a simulation."""
 
 import dataclasses
 from typing import Any
 
+import numpy as np
 from rich.table import Table
 
-from ..dressing import DressedClip
+from ..dressing import DressedClip, Simulation, acting_effects
+from ..simulation import Status
 
 
 def closing_table(clip: DressedClip) -> list[Table]:
-    """What was made, what it cost and how well it sits."""
+    """Two tables: times of the stages, and fit of the garments."""
     times = Table(
         title=f"{clip.num_frames} frames at {clip.fps:g} fps, method {clip.method}",
         title_justify="left",
     )
     times.add_column("stage")
-    times.add_column("first time (ms)", justify="right")
+    times.add_column("first call (ms)", justify="right")
     times.add_column("warm (ms a frame)", justify="right")
     for stage in clip.stages:
         warm = "" if stage.warm_ms is None else f"{stage.warm_ms:.2f}"
         times.add_row(stage.name, f"{stage.cold_ms:.0f}", warm)
-    fit = Table(title="garments, and how much of them is inside the body", title_justify="left")
+    fit = Table(title="garments, and their share inside the body", title_justify="left")
     for name in (
         "garment",
         "vertices",
@@ -45,7 +47,7 @@ def closing_table(clip: DressedClip) -> list[Table]:
 
 
 def report(clip: DressedClip) -> dict[str, Any]:
-    """The same for machines."""
+    """The same data for JSON."""
     return {
         "frames": clip.num_frames,
         "fps": clip.fps,
@@ -77,3 +79,52 @@ def _worst(clip: DressedClip, name: str) -> str:
 
 def _share(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{100 * value:.{digits}f} %"
+
+
+_DIAGNOSTICS = {
+    "strain_p99": ("strain, 99th percentile (%)", 100.0),
+    "strain_max": ("strain, worst edge (%)", 100.0),
+    "penetration_max": ("deepest penetration of the skin (mm)", 1e3),
+    "inside_share": ("vertices inside the skin, worst frame (%)", 100.0),
+    "layers_crossed": ("vertices in the wrong layer, worst frame", 1.0),
+    "self_gap": ("smallest gap of cloth to itself (mm)", 1e3),
+    "pinched": ("vertices inside another limb, worst frame", 1.0),
+    "residual_p99": ("residual, 99th percentile (1 = tolerance)", 1.0),
+    "speed_max": ("fastest vertex (m/s)", 1.0),
+}
+
+
+def rollout_report(clip: DressedClip, simulation: Simulation, seconds: float) -> dict[str, Any]:
+    """A simulation's diagnostics for JSON."""
+    rollout = clip.rollout
+    assert rollout is not None
+    marked = {f.name: int(np.count_nonzero(rollout.status & int(f))) for f in Status}
+    return {
+        "frames": clip.num_frames,
+        "fps": clip.fps,
+        "seconds": seconds,
+        "effects": list(acting_effects(simulation, len(clip.garments))),
+        "worst": rollout.worst,
+        "frames_marked": {k: n for k, n in marked.items() if n},
+    }
+
+
+def rollout_table(clip: DressedClip, simulation: Simulation, seconds: float) -> Table:
+    """A simulation's diagnostics over all frames."""
+    rollout = clip.rollout
+    assert rollout is not None
+    acting = acting_effects(simulation, len(clip.garments))
+    named = ", ".join(acting) or f"forces and contact of {simulation.engine}"
+    table = Table(
+        title=f"{clip.num_frames} frames in {seconds:.1f} s; {named}", title_justify="left"
+    )
+    table.add_column("over all frames")
+    table.add_column("worst", justify="right")
+    for key, (name, scale) in _DIAGNOSTICS.items():
+        if key in rollout.worst:
+            table.add_row(name, f"{scale * rollout.worst[key]:.3g}")
+    for flag in Status:
+        count = int(np.count_nonzero(rollout.status & int(flag)))
+        if count:
+            table.add_row(f"frames marked {flag.name}", str(count))
+    return table

@@ -1,23 +1,22 @@
 """`physxnet train`: a network from a configuration and datasets."""
 
 import math
-import pathlib
 
 from rich.console import Console
 
 from ..data import CARD, list_sequences, read_note, read_sequence
-from ..io import save_predictor
+from ..models import save_predictor
 from ..training import TrainConfig, read_metrics, train as run
-from ._configs import read_config
+from ._configs import config_name, read_config
 from ._experiment_commands import Train
 from ._progress import progress_bars
 
-# What a card tells of each dataset.
-_NAMED = ("engine", "mirror", "speed", "left_out", "upper_from", "exaggerate", "fps", "quantum")
+# What a card records about each dataset.
+_CARD_KEYS = ("engine", "mirror", "speed", "left_out", "upper_from", "exaggerate", "fps", "quantum")
 
 
 def train(command: Train, console: Console) -> int:
-    """Trains, or goes on; leaves the weights in the run's folder."""
+    """Starts or resumes training; writes the weights to the run's folder."""
     config = read_config(command.config, TrainConfig)
     sequences = [
         read_sequence(folder)
@@ -36,18 +35,19 @@ def train(command: Train, console: Console) -> int:
 
         predictor = run(config, sequences, command.out, steps=command.steps, report=report)
     log = read_metrics(command.out)
-    taught = [s for s in sequences if s.name not in config.validation]
+    train_sequences = [s for s in sequences if s.name not in config.validation]
     measured = [x for x in log if math.isfinite(x.get("validation_mm", math.nan))]
     alarms = sum(line.get("gan_alarm", 0.0) for line in log)
     notes = [read_note(root) for root in command.data]
     card = {
         **CARD,
         "data": [
-            {k: n[k] for k in _NAMED if k in n} | {"splits": list(command.splits)} for n in notes
+            {k: n[k] for k in _CARD_KEYS if k in n} | {"splits": list(command.splits)}
+            for n in notes
         ],
         "training": {
-            "actions": len(taught),
-            "frames": sum(s.motion.num_frames for s in taught),
+            "actions": len(train_sequences),
+            "frames": sum(s.motion.num_frames for s in train_sequences),
             "steps": int(log[-1]["step"]) if log else 0,
             **(
                 {
@@ -57,14 +57,14 @@ def train(command: Train, console: Console) -> int:
                 if config.validation and measured
                 else {}
             ),
-            "mirrored too": config.mirror,
+            "mirrored too": config.mirror_augmentation,
             "adversarial": config.adversarial,
             "seed": config.seed,
             "gan_alarms": int(alarms),
             "updates_skipped": int(max((x.get("skipped", 0.0) for x in log), default=0)),
         },
     }
-    name = command.name or pathlib.Path(command.config).stem
+    name = command.name or config_name(command.config)
     save_predictor(command.out / "weights", predictor, name=name, card=card)
     console.print(f"wrote {command.out / 'weights'}", highlight=False)
     if alarms:

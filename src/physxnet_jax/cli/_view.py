@@ -1,4 +1,4 @@
-"""`physxnet view`: the viewer, or a page of it to send."""
+"""`physxnet view`: the viewer, or a self-contained HTML page."""
 
 import os
 import threading
@@ -15,53 +15,53 @@ from ._shape import parse_shape
 
 
 def view(command: View, console: Console, *, over: threading.Event | None = None) -> int:
-    """Serves the page until Ctrl-C, or writes it.
+    """Serves the viewer until Ctrl-C, or writes an HTML page.
 
     Args:
-        command: What was asked for.
-        console: Where to say it.
-        over: Ends the viewer when set.
+        command: The options.
+        console: Where to print.
+        over: Event that closes the viewer.
     """
     if command.live and (command.html is not None or command.method != "network"):
         raise PhysXNetError(
-            "--live asks the network while the page is open: no --html, no other --method."
+            "--live runs the network while the page is open: leave out --html and --method."
         )
     if command.compare and command.method == "simulate":
-        raise PhysXNetError("--compare sets the simulation beside another --method; leave it out.")
+        raise PhysXNetError("--compare is for a --method other than simulate; leave it out.")
     if command.html is not None:
         check_writable(command.html)
+    source = command.source
+    if source.start:
+        raise PhysXNetError("--start: the viewer shows motions from their start; leave it out.")
     choice = Choice(
         motion=command.motion,
-        wear=command.wear,
+        wear=command.outfit.wear,
         method=command.method,
-        weights=command.weights,
+        inference=command.inference.build(),
         compare=command.compare,
         live=command.live,
-        push_out=command.push_out,
         shape=tuple(parse_shape(command.shape).items()),
-        accuracy=command.accuracy,
-        fabric=command.fabric,
-        wind=command.wind,
-        self_contact=command.self_contact,
-        frames=command.frames,
-        fps=command.fps,
-        source_fps=command.source_fps,
-        skeleton=command.skeleton,
-        joint_map=command.joint_map,
+        simulation=command.simulation.build(),
+        fabric=command.outfit.fabric,
+        frames=source.frames or Choice().frames,
+        fps=source.fps,
+        source_fps=source.source_fps,
+        skeleton=source.skeleton,
+        joint_map=source.joint_map,
     )
     if command.html is not None:
         with progress_bars(console) as progress:
             shown = record(command.html, choice, progress)
         size = command.html.stat().st_size / 1e6
-        console.print(shown.told.replace("* ", ""), highlight=False)
+        console.print(shown.summary.replace("* ", ""), highlight=False)
         console.print(f"wrote {command.html} ({size:.1f} MB)", highlight=False)
         return 0
     viewer = Viewer(choice, host=command.host, port=command.port)
     try:
-        console.print(f"viewer at {viewer.url}; Ctrl-C ends it", highlight=False)
+        console.print(f"viewer at {viewer.url}; Ctrl-C stops it", highlight=False)
         port = viewer.server.get_port()
         if os.environ.get("SSH_CONNECTION"):
-            console.print(f"from afar: ssh -L {port}:localhost:{port} this-machine")
+            console.print(f"remote access: ssh -L {port}:localhost:{port} this-machine")
         elif command.browser:
             webbrowser.open(viewer.url)
         (threading.Event() if over is None else over).wait()

@@ -1,4 +1,4 @@
-"""Building a dataset: every action, every template, through a simulator."""
+"""Builds a dataset: simulates every action with every template."""
 
 import math
 import pathlib
@@ -27,7 +27,7 @@ from ..simulation.blender import simulate_blender
 from ._config import CARD, DatasetConfig
 from ._protocol import FPS, Action, left_out, load_action, read_protocol
 from ._store import (
-    QUANTUM,
+    QUANTIZATION_STEP,
     is_stored,
     log_build,
     open_dataset,
@@ -50,31 +50,31 @@ def build_dataset(
 ) -> int:
     """Simulates actions and stores the cloth relative to its skinning.
 
-    What is already there is kept, so a build that was stopped goes on where it was, and
-    several shards may be built side by side into one folder.
+    Existing results are kept, so an interrupted build can be resumed. Several shards can be
+    built concurrently into one folder.
 
     Args:
-        config: What to build.
-        root: Where the dataset goes.
-        folder: Where the motion files and ``ACTIONS.csv`` lie.
-        shard: ``(i, n)``: every n-th action from the i-th.
-        only: Names of actions; all of them if empty.
-        report: Called with a text, jobs done and jobs in all.
-        ask: What the networks of the configuration answer: a garment's vertices [m], shape
-            [frames, vertices, 3].
+        config: Settings of the dataset.
+        root: Folder of the dataset.
+        folder: Folder with the motion files and ``ACTIONS.csv``.
+        shard: ``(i, n)``: every n-th action, starting with the i-th.
+        only: Names of the actions to build; all of them if empty.
+        report: Callback that takes a message, the jobs done and the total number of jobs.
+        ask: Predicts a garment's vertices [m], shape [frames, vertices, 3], with the networks
+            of the configuration. Required if and only if the engine is ``network``.
 
     Returns:
-        Number of garments simulated now.
+        Number of garments simulated by this call.
 
     Raises:
-        FormatError: Another dataset lies at ``root``, ``only`` names no action of it, or
-            there is no ``ask`` for networks.
-        MotionError: No protocol in ``folder``.
+        FormatError: ``root`` holds another dataset, an action of ``only`` isn't available,
+            ``upper_from`` selects the action itself, or ``ask`` doesn't match the engine.
+        MotionError: ``folder`` holds no protocol.
     """
     root = pathlib.Path(root)
     if (config.engine == "network") != (ask is not None):
-        raise FormatError(f"engine {config.engine}: say what networks answer, for these alone.")
-    actions = _chosen(folder, config.splits)
+        raise FormatError(f"engine is '{config.engine}'; pass ask if and only if it is 'network'.")
+    actions = _actions_in_splits(folder, config.splits)
     unknown = set(only) - {a.name for a in actions}
     if unknown:
         raise FormatError(
@@ -82,21 +82,21 @@ def build_dataset(
             f" there are: {', '.join(a.name for a in actions)}."
         )
     if config.left_out:
-        # Of all of them: a stretch between two actions belongs to one.
+        # Before `only` is applied: actions cut from one clip share its unused stretch.
         actions = left_out(folder, actions)
         if without := set(only) - {a.name for a in actions}:
-            raise FormatError(f"the protocol leaves nothing out of {', '.join(sorted(without))}.")
+            raise FormatError(f"left_out selects no frames for {', '.join(sorted(without))}.")
     for split in config.splits if config.upper_from else ():
         number = sum(a.split == split for a in actions)
         if number and config.upper_from % number == 0:
             raise FormatError(
-                f"upper_from is {config.upper_from}: {number} actions further on of the split"
-                f" '{split}' is the action itself."
+                f"upper_from is {config.upper_from}: with {number} actions in the split"
+                f" '{split}', that is the action itself."
             )
     actions = [a for a in actions if not only or a.name in only]
     open_dataset(root, _note(config))
-    mine = actions[shard[0] :: shard[1]]
-    jobs: list[tuple[Template, Action]] = [(t, a) for t in config.templates for a in mine]
+    own_actions = actions[shard[0] :: shard[1]]
+    jobs: list[tuple[Template, Action]] = [(t, a) for t in config.templates for a in own_actions]
     done = 0
     prepared: tuple[str, PreparedScene] | None = None
     for k, (name, action) in enumerate(jobs):
@@ -106,7 +106,7 @@ def build_dataset(
         if is_stored(target, name):
             continue
         if prepared is None or prepared[0] != name:
-            # Programs of the garment before are of no more use.
+            # Programs compiled for the previous garment are no longer needed.
             jax.clear_caches()
             prepared = (name, prepare_scene(Scene((template(name),))))
         scene = prepared[1]
@@ -120,20 +120,20 @@ def build_dataset(
 
 
 def expected_frames(root: str | pathlib.Path, folder: str | pathlib.Path) -> dict[str, int]:
-    """How many frames each action of a dataset should have, by its own note.
+    """Expected number of frames of each action, from the dataset's own settings.
 
     Args:
-        root: The dataset.
-        folder: Where the motion files and ``ACTIONS.csv`` lie.
+        root: Folder of the dataset.
+        folder: Folder with the motion files and ``ACTIONS.csv``.
     """
     note = read_note(root)
-    actions = _chosen(folder, note["splits"])
+    actions = _actions_in_splits(folder, note["splits"])
     if note.get("left_out", False):
         actions = left_out(folder, actions)
     return {a.name: frames_at_speed(a.frames, note.get("speed", 1.0)) for a in actions}
 
 
-def _chosen(folder: str | pathlib.Path, splits: Collection[str]) -> list[Action]:
+def _actions_in_splits(folder: str | pathlib.Path, splits: Collection[str]) -> list[Action]:
     return [a for a in read_protocol(folder) if a.split in splits]
 
 
@@ -142,7 +142,7 @@ def _note(config: DatasetConfig) -> dict[str, Any]:
         "format": 2,
         "fps": FPS,
         "unit": "m",
-        "quantum": QUANTUM,
+        "quantum": QUANTIZATION_STEP,
         "values": "cloth minus its linear blend skinning, world axes, Y up",
         "splits": list(config.splits),
         "templates": list(config.templates),
@@ -155,10 +155,10 @@ def _note(config: DatasetConfig) -> dict[str, Any]:
 
 
 def _changes(config: DatasetConfig) -> dict[str, Any]:
-    """Settings that sets built before there were any don't name."""
+    """Settings that differ from their defaults; datasets of earlier versions don't list them."""
     changes = {k: getattr(config, k) for k in ("left_out", "upper_from", "exaggerate")}
-    usual = DatasetConfig()
-    return {k: v for k, v in changes.items() if v != getattr(usual, k)}
+    defaults = DatasetConfig()
+    return {k: v for k, v in changes.items() if v != getattr(defaults, k)}
 
 
 def _simulate(
@@ -172,7 +172,7 @@ def _simulate(
 ) -> None:
     motion = action_motion(config, action, scene.assembly.body, folder)
     write_action(target, motion, action.split)
-    began = time.perf_counter()
+    start = time.perf_counter()
     if ask is not None:
         cloth = ask(motion, name)
         finite = np.asarray(np.isfinite(cloth).all(axis=(1, 2)))
@@ -181,13 +181,13 @@ def _simulate(
         rollout = simulate_blender(Scene((template(name),)), motion, settings=config.blender)
     else:
         rollout = simulate_batch(scene, [motion], solver=config.solver)[0]
-    seconds = time.perf_counter() - began
+    seconds = time.perf_counter() - start
     offsets = rollout.positions[0] - skinned_cloth(scene, motion)
-    # JSON knows no infinity and no NaN.
+    # JSON has no infinity and no NaN.
     worst = {k: v for k, v in rollout.worst.items() if math.isfinite(v)}
     finite = bool(np.isfinite(offsets).all() and rollout.finite.all())
     if not np.isfinite(offsets).all() or np.abs(offsets).max() > 3.0:
-        # It stays on record as failed; one explosion doesn't stop a build.
+        # Recorded as failed: one diverged simulation doesn't stop a build.
         offsets = np.zeros_like(offsets)
         finite = False
     write_offsets(
@@ -203,12 +203,12 @@ def _simulate(
 def action_motion(
     config: DatasetConfig, action: Action, body: Body, folder: pathlib.Path
 ) -> Motion:
-    """An action as a configuration wants it: of whose arms, how wide, which side, how fast."""
+    """Loads an action and applies the settings: upper body, exaggeration, mirror, speed."""
     motion = load_action(folder, action)
     if config.upper_from:
         split = [a for a in read_protocol(folder) if a.split == action.split]
-        place = next(k for k, a in enumerate(split) if a.name == action.name)
-        other = load_action(folder, split[(place + config.upper_from) % len(split)])
+        index = next(k for k, a in enumerate(split) if a.name == action.name)
+        other = load_action(folder, split[(index + config.upper_from) % len(split)])
         motion = with_upper_body(body, motion, other)
     if config.exaggerate != 1.0:
         motion = exaggerated(motion, config.exaggerate)
@@ -220,7 +220,7 @@ def action_motion(
 
 
 def skinned_cloth(scene: PreparedScene, motion: Motion) -> np.ndarray:
-    """Linear blend skinning of a scene's cloth [m], frame by frame."""
+    """Linear blend skinning of a scene's cloth [m] in every frame."""
     a = scene.assembly
     moved = animate(
         a.body,

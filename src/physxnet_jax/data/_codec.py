@@ -1,4 +1,4 @@
-"""Cloth on disk without loss: what neighbours and the frame before tell isn't stored."""
+"""Lossless predictive coding of cloth: only residuals are stored."""
 
 import dataclasses
 
@@ -10,28 +10,28 @@ from scipy.spatial.distance import cdist
 
 from ..geometry import mesh_edges
 
-# Vertices that each one is foretold from.
-_PARENTS = 10
-# Cloth moves alike over this distance [m].
-_ALIKE = 0.06
-# How little of a movement is shared, relative to all of it.
-_OWN = 1e-2
-# Weights are whole parts of this, so that every machine decodes the same numbers.
-_ONE = 4096
-_FAR = 10.0
+# Number of vertices that each one is predicted from.
+_NUM_PARENTS = 10
+# Correlation length of the motion of cloth [m].
+_LENGTH_SCALE = 0.06
+# Variance of a vertex's independent motion, relative to that of the shared motion.
+_NOISE_VARIANCE = 1e-2
+# Weights are stored in units of 1/4096, so that every machine decodes the same numbers.
+_WEIGHT_UNIT = 4096
+_MAX_DISTANCE = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Codec:
-    """Foretells how a vertex moves from vertices that come before it.
+    """Predicts the motion of each vertex from vertices that precede it.
 
-    Vertices are ordered so that each is the farthest from all before it: all but the
-    first few lie between others, and are interpolated instead of extrapolated.
+    Vertices are in farthest-point order: each is the farthest from all that precede it.
+    All but the first few lie between others and are interpolated instead of extrapolated.
 
     Attributes:
-        order: Vertices in their order.
-        parents: Those each one is foretold from.
-        weights: With which weights [1/4096].
+        order: Vertices in coding order.
+        parents: Vertices that each one is predicted from.
+        weights: Weights of the prediction [1/4096].
     """
 
     order: Int[np.ndarray, " vertices"]
@@ -41,32 +41,32 @@ class Codec:
     def encode(
         self, values: Int[np.ndarray, "frames vertices 3"]
     ) -> UInt[np.ndarray, "3 vertices frames"]:
-        """What is left of whole numbers once the foretold part is taken away."""
-        moved = np.diff(values.astype(np.int64), axis=0, prepend=0)
-        left = moved - self._foretell(moved, np.arange(len(self.order)))
-        left = np.where(left >= 0, 2 * left, -2 * left - 1)
-        return left[:, self.order].transpose(2, 1, 0).astype(np.uint32)
+        """Residuals of integers after temporal and spatial prediction, zigzag-coded."""
+        motion = np.diff(values.astype(np.int64), axis=0, prepend=0)
+        residuals = motion - self._predict_residual(motion, np.arange(len(self.order)))
+        residuals = np.where(residuals >= 0, 2 * residuals, -2 * residuals - 1)
+        return residuals[:, self.order].transpose(2, 1, 0).astype(np.uint32)
 
     def decode(
-        self, left: UInt[np.ndarray, "3 vertices frames"]
+        self, residuals: UInt[np.ndarray, "3 vertices frames"]
     ) -> Int[np.ndarray, "frames vertices 3"]:
-        """The whole numbers again."""
-        left = left.transpose(2, 1, 0).astype(np.int64)
-        left = np.where(left % 2 == 0, left // 2, -(left + 1) // 2)
-        moved = np.empty_like(left)
-        moved[:, self.order] = left
+        """Restores the integers from their residuals."""
+        residuals = residuals.transpose(2, 1, 0).astype(np.int64)
+        residuals = np.where(residuals % 2 == 0, residuals // 2, -(residuals + 1) // 2)
+        motion = np.empty_like(residuals)
+        motion[:, self.order] = residuals
         for rows in self._generations():
-            moved[:, rows] += self._foretell(moved, rows)
-        return np.cumsum(moved, axis=0)
+            motion[:, rows] += self._predict_residual(motion, rows)
+        return np.cumsum(motion, axis=0)
 
-    def _foretell(self, moved: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        total = np.full((len(moved), len(rows), 3), _ONE // 2, np.int64)
+    def _predict_residual(self, motion: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        total = np.full((len(motion), len(rows), 3), _WEIGHT_UNIT // 2, np.int64)
         for k in range(self.parents.shape[1]):
-            total += self.weights[rows, k][:, None] * moved[:, self.parents[rows, k]]
-        return total // _ONE
+            total += self.weights[rows, k][:, None] * motion[:, self.parents[rows, k]]
+        return total // _WEIGHT_UNIT
 
     def _generations(self) -> list[np.ndarray]:
-        """Vertices that can be told at once, as all their parents are known."""
+        """Groups of vertices that can be decoded at once, as all their parents are known."""
         age = np.zeros(len(self.order), np.int64)
         for v in self.order:
             used = self.parents[v][self.weights[v] != 0]
@@ -85,14 +85,14 @@ def make_codec(
 
     References:
         Karni and Gotsman, Compression of soft-body animation sequences (2004), for
-        foretelling in space and time; the weights are those of a Gaussian process.
+        prediction in space and time; the weights are those of a Gaussian process.
     """
     x = np.asarray(vertices, np.float64)
     n = len(x)
     edges = mesh_edges(faces).vertices
     length = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
     graph = coo_matrix((np.maximum(length, 1e-9), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    apart = np.minimum(dijkstra((graph + graph.T).tocsr()), _FAR)
+    apart = np.minimum(dijkstra((graph + graph.T).tocsr()), _MAX_DISTANCE)
     order = np.empty(n, np.int64)
     gap = np.full(n, np.inf)
     v = 0
@@ -101,14 +101,14 @@ def make_codec(
         gap = np.minimum(gap, apart[v])
         gap[v] = -1.0
         v = int(gap.argmax())
-    parents = np.zeros((n, _PARENTS), np.int64)
-    weights = np.zeros((n, _PARENTS), np.int64)
+    parents = np.zeros((n, _NUM_PARENTS), np.int64)
+    weights = np.zeros((n, _NUM_PARENTS), np.int64)
     for k in range(1, n):
         v, before = order[k], order[:k]
-        near = before[np.argsort(apart[v, before], kind="stable")[:_PARENTS]]
-        alike = np.exp(-0.5 * (cdist(x[near], x[near]) / _ALIKE) ** 2)
-        to = np.exp(-0.5 * (np.linalg.norm(x[near] - x[v], axis=1) / _ALIKE) ** 2)
-        share = np.linalg.solve(alike + _OWN * np.eye(len(near)), to)
+        near = before[np.argsort(apart[v, before], kind="stable")[:_NUM_PARENTS]]
+        kernel = np.exp(-0.5 * (cdist(x[near], x[near]) / _LENGTH_SCALE) ** 2)
+        covariance = np.exp(-0.5 * (np.linalg.norm(x[near] - x[v], axis=1) / _LENGTH_SCALE) ** 2)
+        share = np.linalg.solve(kernel + _NOISE_VARIANCE * np.eye(len(near)), covariance)
         parents[v, : len(near)] = near
-        weights[v, : len(near)] = np.round(_ONE * share)
+        weights[v, : len(near)] = np.round(_WEIGHT_UNIT * share)
     return Codec(order, parents, weights)

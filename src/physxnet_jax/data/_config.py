@@ -1,4 +1,4 @@
-"""What a dataset is made of."""
+"""The configuration of a dataset."""
 
 import dataclasses
 from typing import Any, Literal
@@ -9,7 +9,7 @@ from ..simulation import XPBD
 from ..simulation.blender import BlenderSettings
 
 SPLITS = ("train", "test", "extra")
-"""Parts of the protocol."""
+"""Splits of the protocol."""
 
 CARD: dict[str, Any] = {
     "licence": "The motion is the CMU Graphics Lab Motion Capture Database's, free for all uses"
@@ -25,19 +25,19 @@ class DatasetConfig:
 
     Attributes:
         engine: ``physxnet`` (this package's simulator), ``blender`` (the paper's) or
-            ``network``: what trained networks answer, for another one to learn from.
-        splits: Of the protocol: ``train``, ``test``, ``extra``.
-        templates: Garments, each simulated by itself.
-        left_out: Not the actions themselves, but what the protocol leaves out of their
-            clips, see `left_out`.
-        mirror: Left and right of every motion are exchanged.
-        speed: Every motion is played this many times as fast.
-        upper_from: Spine, arms and head are taken from the action this many places
-            further on in the same split; 0 leaves them.
-        exaggerate: Joints turn this many times as far from their mean rotation.
-        solver: Settings of our simulator.
-        blender: Settings of Blender's.
-        networks: Names or folders of weights whose mean answer is stored.
+            ``network``: predictions of trained networks, as targets for another one.
+        splits: Splits of the protocol: ``train``, ``test``, ``extra``.
+        templates: Garments, each simulated separately.
+        left_out: Use the frames of the actions' clips that the protocol leaves out instead of
+            the actions themselves, see `left_out`.
+        mirror: Exchange left and right in every motion.
+        speed: Play every motion this many times as fast.
+        upper_from: Take spine, arms and head from the action this many places further on in
+            the same split; 0 disables this.
+        exaggerate: Factor on the deviation of each joint from its mean rotation.
+        solver: Settings of this package's simulator.
+        blender: Settings of Blender's simulator.
+        networks: Names or folders of weights whose mean prediction is stored.
     """
 
     engine: Literal["physxnet", "blender", "network"] = "physxnet"
@@ -54,17 +54,20 @@ class DatasetConfig:
 
     def __post_init__(self) -> None:
         check_numbers(self, "speed", "exaggerate")
-        for name, told, known in (
+        for name, given, known in (
             ("splits", self.splits, SPLITS),
             ("templates", self.templates, TEMPLATES),
         ):
-            if not told or set(told) - set(known):
-                raise ValueError(f"{name} are {told}; there are {', '.join(known)}.")
+            if not given or set(given) - set(known):
+                raise ValueError(f"{name} are {given}; there are {', '.join(known)}.")
         if (self.engine == "network") != bool(self.networks):
-            raise ValueError(f"engine {self.engine} with networks {self.networks}: name both.")
+            raise ValueError(
+                f"engine is '{self.engine}', networks is {self.networks}: set networks if and only"
+                " if engine is 'network'."
+            )
 
     def settings(self) -> dict[str, Any]:
-        """What the engine is told, and nothing of the others."""
+        """Settings of the selected engine only."""
         if self.engine == "network":
             return {"engine": self.engine, "networks": list(self.networks)}
         used = self.solver if self.engine == "physxnet" else self.blender

@@ -1,4 +1,4 @@
-"""What a mirror shows of a simulated action: as much again to learn from, for nothing."""
+"""Mirrored copies of simulated actions: augmentation without further simulation."""
 
 import dataclasses
 import functools
@@ -17,11 +17,11 @@ _FLIP = np.array([-1.0, 1.0, 1.0], np.float32)
 
 
 def mirrored_sequence(body: Body, sequence: Sequence) -> Sequence:
-    """A simulated action as a mirror shows it: motion and cloth, left and right exchanged.
+    """A simulated action mirrored in x = 0: motion and cloth, left and right exchanged.
 
     The halves of the templates match to 0.02 mm (a few vertices at hems to 3 mm), but
-    not vertex by vertex: what lies at a vertex's mirror image is blended from the corners
-    of the triangle there.
+    not vertex by vertex. Offsets at the mirror image of a vertex are interpolated from the
+    corners of the triangle there.
 
     Args:
         body: The body, whose skeleton is the same on both sides.
@@ -52,8 +52,8 @@ def mirrored_offsets(
 def _mirror_images(
     name: Template,
 ) -> tuple[Int[np.ndarray, "vertices 3"], Float[np.ndarray, "vertices 3"]]:
-    """Where each vertex's mirror image lies on the template: corners and weights."""
+    """The mirror image of each vertex on the template: triangle corners and weights."""
     mesh = template(name).mesh
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    foot = closest_points(make_mesh(vertices, faces), jnp.asarray(vertices * _FLIP))
-    return faces[np.asarray(foot.face)], np.asarray(foot.weights)
+    closest = closest_points(make_mesh(vertices, faces), jnp.asarray(vertices * _FLIP))
+    return faces[np.asarray(closest.face)], np.asarray(closest.weights)

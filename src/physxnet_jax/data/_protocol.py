@@ -1,4 +1,4 @@
-"""The experiment's actions, as a table beside the motion files tells them."""
+"""The experiment's actions, read from a table beside the motion files."""
 
 import csv
 import dataclasses
@@ -15,10 +15,10 @@ from ..motion import Motion, load_motion, sample
 
 FPS = 30.0
 _Row = TypeVar("_Row")
-# Frames of what is left of a clip: two seconds at least, about as much as two actions at most.
-_SHORTEST, _LONGEST = 60, 400
-_HOW = (
-    "Name the folder that holds it and the motion files (--mocap); docs/protocol.md tells its"
+# Length of an unused stretch in frames: at least two seconds, at most about two actions.
+_MIN_FRAMES, _MAX_FRAMES = 60, 400
+_FIX = (
+    "Pass the folder that holds it and the motion files (--mocap); docs/protocol.md lists its"
     " columns"
 )
 
@@ -29,11 +29,11 @@ class Action:
 
     Attributes:
         split: ``train``, ``test`` or ``extra``.
-        name: What the person does.
+        name: Name of the action.
         file: Motion file, relative to the table.
         start: Where the action begins in the file [s].
         frames: Number of frames at 30 per second.
-        fps: True frame rate of the file [1/s], None to believe its header.
+        fps: True frame rate of the file [1/s]; None to use that of its header.
     """
 
     split: str
@@ -45,7 +45,7 @@ class Action:
 
     @property
     def slug(self) -> str:
-        """The name as a folder."""
+        """The name as a folder name."""
         return re.sub(r"[^a-z0-9]+", "_", self.name.lower()).strip("_")
 
 
@@ -61,7 +61,7 @@ def _rows(path: pathlib.Path, read: Callable[[dict[str, str]], _Row]) -> list[_R
                     path,
                     lines.line_num,
                     f"not a row of the protocol ({type(error).__name__}: {error})",
-                    _HOW,
+                    _FIX,
                 ) from None
     return out
 
@@ -70,15 +70,15 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
     """The actions listed in ``ACTIONS.csv``, with true rates from ``CLIPS.csv``.
 
     Args:
-        folder: Where both tables and the motion files lie.
+        folder: Folder with both tables and the motion files.
 
     Raises:
-        MotionError: No table there, or one without its columns and numbers.
+        MotionError: The table is missing or malformed, or two actions share a folder name.
     """
     folder = pathlib.Path(folder)
     table = folder / "ACTIONS.csv"
     if not table.is_file():
-        raise MotionError.at(table, None, "no such file", _HOW)
+        raise MotionError.at(table, None, "no such file", _FIX)
     rates: dict[str, float] = {}
     clips = folder / "CLIPS.csv"
     if clips.is_file():
@@ -97,12 +97,12 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
     seen: dict[str, str] = {}
     for action in actions:
         if not action.slug or action.slug in seen:
-            other = f"'{seen[action.slug]}' beside it" if action.slug else "letters a to z"
+            other = f"'{seen[action.slug]}' has the same" if action.slug else "no a to z or 0 to 9"
             raise MotionError.at(
                 table,
                 None,
-                f"the action '{action.name}' has no folder of its own, for {other}",
-                "Give each another name, of letters and digits",
+                f"no unique folder name for the action '{action.name}': {other}",
+                "Give every action a distinct name of letters and digits",
             )
         seen[action.slug] = action.name
     return actions
@@ -111,53 +111,53 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
 def left_out(folder: str | pathlib.Path, actions: list[Action]) -> list[Action]:
     """The longest stretch of each action's clip that no action of the protocol uses.
 
-    Clips that a test action is cut from are left alone, and so is what is shorter than
-    two seconds; no stretch is longer than 400 frames.
+    Clips that contain a test action are skipped, and so are stretches shorter than two
+    seconds. Stretches are cut to 400 frames.
 
     Args:
-        folder: Where the motion files and ``ACTIONS.csv`` lie.
-        actions: Whose clips are asked for.
+        folder: Folder with the motion files and ``ACTIONS.csv``.
+        actions: Actions whose clips are searched.
 
     Returns:
-        Actions of the same names and splits, with other frames; of several cut from one
-        clip the first.
+        Actions of the same names and splits with other frames. Of several actions cut from
+        one clip, only the first is returned.
     """
     folder = pathlib.Path(folder)
-    everything = read_protocol(folder)
-    out, looked = [], set()
+    all_actions = read_protocol(folder)
+    out, searched = [], set()
     for action in actions:
-        # Of two actions cut from one clip the second would be given the same stretch again.
-        if action.file in looked:
+        # A second action cut from the same clip would get the same stretch.
+        if action.file in searched:
             continue
-        looked.add(action.file)
-        same = [a for a in everything if a.file == action.file]
-        if any(a.split == "test" for a in same):
+        searched.add(action.file)
+        same_clip = [a for a in all_actions if a.file == action.file]
+        if any(a.split == "test" for a in same_clip):
             continue
         clip = load_motion(folder / action.file, source_fps=action.fps)
-        spans = sorted((a.start, a.start + a.frames / FPS) for a in same)
+        spans = sorted((a.start, a.start + a.frames / FPS) for a in same_clip)
         # The first frame of many clips is a calibration pose.
         begins = [3.0 / FPS, *itertools.accumulate((end for _, end in spans), max)]
         ends = [*(begin for begin, _ in spans), (clip.num_frames - 1) / clip.fps]
         begin, end = max(zip(begins, ends), key=lambda gap: gap[1] - gap[0])
-        frames = min(int((end - begin) * FPS), _LONGEST)
-        if frames >= _SHORTEST:
+        frames = min(int((end - begin) * FPS), _MAX_FRAMES)
+        if frames >= _MIN_FRAMES:
             out.append(dataclasses.replace(action, start=begin, frames=frames))
     return out
 
 
 def load_action(folder: str | pathlib.Path, action: Action) -> Motion:
-    """The frames of an action, at 30 a second, by spherical interpolation.
+    """The frames of an action, resampled to 30 per second by spherical interpolation.
 
     Raises:
-        MotionError: Its file can't be read, or isn't as long.
+        MotionError: Its file can't be read or doesn't cover the action.
     """
     clip = load_motion(pathlib.Path(folder) / action.file, source_fps=action.fps)
     end = action.start + (action.frames - 1) / FPS
     last = (clip.num_frames - 1) / clip.fps
     if not (action.start >= 0.0 and end <= last + 1e-3):
         raise MotionError(
-            f"{action.file}: {action.name} goes from {action.start:g} to {end:.2f} s, the clip to"
-            f" {last:.2f} s. Correct the table of actions."
+            f"{action.file}: {action.name} goes from {action.start:g} to {end:.2f} s, but the"
+            f" clip ends at {last:.2f} s. Correct the table of actions."
         )
     times = action.start + np.arange(action.frames) / FPS
     motion = sample(clip, times, FPS)

@@ -1,7 +1,7 @@
-"""Simulated actions on disk: zarr arrays through tensorstore, one folder an action.
+"""Simulated actions on disk: zarr arrays through tensorstore, one folder per action.
 
-``dataset.json`` tells what the set is, ``garments/`` holds each garment once, and every
-action's folder the motion and an array for each garment. The body follows from the motion.
+``dataset.json`` describes the dataset, ``garments/`` holds each garment once, and every
+action's folder holds the motion and one array per garment. The body follows from the motion.
 """
 
 import contextlib
@@ -21,17 +21,17 @@ import tensorstore as ts
 from jaxtyping import Float, Int
 
 from ..errors import FormatError
-from ..files import append_line, read_arrays, read_lines, whole_file
+from ..files import append_line, atomic_write, read_arrays, read_lines
 from ..motion import Motion, load_motion, save_motion
 from ._codec import Codec, make_codec
 
-# Offsets are stored as whole tenths of a millimetre: the error is at most 0.05 mm.
-QUANTUM = 1e-4
-_LARGEST = 3.2
-# Coordinates of a garment in an action that are read at most.
-_MOST = 3e8
+# Offsets are rounded to tenths of a millimetre: the error is at most 0.05 mm.
+QUANTIZATION_STEP = 1e-4
+_MAX_OFFSET = 3.2
+# Largest number of coordinates that are read for one garment in one action.
+_MAX_COORDINATES = 3e8
 _NOTE = "dataset.json"
-# Times differ from run to run: they are no part of what a dataset is.
+# Timings differ between runs: the log isn't part of the dataset's digest.
 _LOG = "build_log.jsonl"
 
 
@@ -45,7 +45,7 @@ class Sequence:
         motion: The body's motion.
         offsets: For each template, cloth minus its linear blend skinning [m], shape
             [frames, vertices, 3].
-        meta: What else was noted of each: engine, settings, diagnostics.
+        meta: Further metadata of each template: engine, settings, diagnostics.
     """
 
     name: str
@@ -56,41 +56,41 @@ class Sequence:
 
 
 def open_dataset(root: str | pathlib.Path, note: dict[str, Any]) -> None:
-    """Begins a dataset, or makes sure that the one there is the same.
+    """Creates a dataset, or checks that the existing one has the same configuration.
 
     Raises:
-        FormatError: Another dataset lies there.
+        FormatError: The folder holds another dataset.
     """
     path = pathlib.Path(root) / _NOTE
     text = json.dumps(note, indent=1, sort_keys=True)
     if path.is_file():
         if read_note(root) != json.loads(text):
             raise FormatError(
-                f"{root}: a dataset of another configuration lies there. Choose another"
+                f"{root}: the folder holds a dataset of another configuration. Choose another"
                 " folder or delete it."
             )
         return
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_text(text)
 
 
 def read_note(root: str | pathlib.Path) -> dict[str, Any]:
-    """What a dataset says of itself.
+    """The settings that a dataset stores about itself.
 
     Raises:
-        FormatError: There is none.
+        FormatError: The file is missing or damaged.
     """
     path = pathlib.Path(root) / _NOTE
     if not path.is_file():
         raise FormatError(f"{root}: no {_NOTE}, not a dataset; build one first.")
-    with _damage_told(path):
-        return _table(json.loads(path.read_text()))
+    with _report_damage(path):
+        return _as_dict(json.loads(path.read_text()))
 
 
-def _table(told: object) -> dict[str, Any]:
-    if not isinstance(told, dict):
+def _as_dict(parsed: object) -> dict[str, Any]:
+    if not isinstance(parsed, dict):
         raise TypeError("not a table")
-    return told
+    return parsed
 
 
 def write_garment(
@@ -99,21 +99,21 @@ def write_garment(
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
 ) -> None:
-    """Stores a garment at rest [m] and how its offsets are coded, once.
+    """Stores a garment at rest [m] and the codec of its offsets, once.
 
     Raises:
-        FormatError: Another garment lies there under that name, or one of too many vertices.
+        FormatError: Another garment is stored under that name, or it has too many vertices.
     """
     path = pathlib.Path(root) / "garments" / f"{name}.npz"
     if path.is_file():
-        before = _archive(path)
+        stored = _archive(path)
         if not (
-            np.array_equal(before["faces"], faces)
-            and np.allclose(before["vertices"], vertices, atol=1e-5)
+            np.array_equal(stored["faces"], faces)
+            and np.allclose(stored["vertices"], vertices, atol=1e-5)
         ):
             raise FormatError(
-                f"{path}: another garment of that name lies there; what is stored was told from"
-                " it. Choose another folder, or delete it."
+                f"{path}: another garment of that name is stored there, and existing offsets are"
+                " coded with it. Choose another folder, or delete it."
             )
         return
     if len(vertices) > np.iinfo(np.int16).max:
@@ -121,7 +121,7 @@ def write_garment(
             f"{name}: {len(vertices):,} vertices; a dataset's garments have 32,767 at most."
         )
     codec = make_codec(vertices, faces)
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         np.savez_compressed(
             part,
             vertices=np.asarray(vertices, np.float32),
@@ -140,27 +140,27 @@ def _codec(path: pathlib.Path, changed: int) -> Codec:
 
 def _archive(path: pathlib.Path) -> dict[str, np.ndarray]:
     names = ("vertices", "faces", "order", "parents", "weights")
-    with _damage_told(path):
+    with _report_damage(path):
         data = read_arrays(path, names)
         data = {name: data[name] for name in names}
         count = len(data["vertices"])
-        whole = [data[k] for k in ("faces", "order", "parents", "weights")]
-        if data["vertices"].dtype.kind != "f" or any(x.dtype.kind not in "iu" for x in whole):
-            raise TypeError("arrays of other kinds")
+        integers = [data[k] for k in ("faces", "order", "parents", "weights")]
+        if data["vertices"].dtype.kind != "f" or any(x.dtype.kind not in "iu" for x in integers):
+            raise TypeError("unexpected data types")
         shapes = (data["parents"].shape, data["weights"].shape)
         if shapes[0] != shapes[1] or len(shapes[0]) != 2 or shapes[0][0] != count:
-            raise ValueError("arrays of other shapes")
-        places = (data["parents"], data["faces"], data["order"])
-        if any(x.min(initial=0) < 0 or x.max(initial=0) >= count for x in places):
-            raise ValueError("vertices that aren't there")
+            raise ValueError("unexpected shapes")
+        indices = (data["parents"], data["faces"], data["order"])
+        if any(x.min(initial=0) < 0 or x.max(initial=0) >= count for x in indices):
+            raise ValueError("vertex indices out of range")
         if not np.array_equal(np.sort(data["order"]), np.arange(count)):
-            raise ValueError("no order of the vertices")
+            raise ValueError("order isn't a permutation of the vertices")
         return data
 
 
 @contextlib.contextmanager
-def _damage_told(path: pathlib.Path) -> Iterator[None]:
-    """What a library says of a damaged file, as `FormatError`."""
+def _report_damage(path: pathlib.Path) -> Iterator[None]:
+    """Converts errors of a damaged file to `FormatError`."""
     try:
         yield
     except FormatError:
@@ -175,7 +175,7 @@ def _damage_told(path: pathlib.Path) -> Iterator[None]:
 def _codec_of(folder: pathlib.Path, template: str) -> Codec:
     path = folder.parent / "garments" / f"{template}.npz"
     if not path.is_file():
-        raise FormatError(f"{path}: missing; the garment of {folder.name}/{template}.")
+        raise FormatError(f"{path}: missing; {folder.name}/{template} needs this garment.")
     return _codec(path.absolute(), path.stat().st_mtime_ns)
 
 
@@ -185,24 +185,25 @@ def write_offsets(
     offsets: Float[np.ndarray, "frames vertices 3"],
     meta: dict[str, Any],
 ) -> None:
-    """One garment of one action; it appears whole or not at all.
+    """Writes the offsets of one garment in one action, atomically.
 
     Args:
         folder: The action's folder.
         template: Name of the garment; `write_garment` stored it.
         offsets: Cloth minus skinning [m].
-        meta: Noted as attributes of the array.
+        meta: Stored as attributes of the array.
 
     Raises:
-        FormatError: An offset beyond the 3.2 m that can be stored: an explosion.
+        FormatError: An offset isn't finite or exceeds the 3.2 m that can be stored: the
+            simulation diverged.
     """
-    whole = np.round(offsets / QUANTUM)
-    if not np.isfinite(whole).all() or np.abs(whole).max() > _LARGEST / QUANTUM:
+    integers = np.round(offsets / QUANTIZATION_STEP)
+    if not np.isfinite(integers).all() or np.abs(integers).max() > _MAX_OFFSET / QUANTIZATION_STEP:
         raise FormatError(
-            f"{folder.name}/{template}: cloth is more than {_LARGEST} m from the body or not"
+            f"{folder.name}/{template}: cloth is more than {_MAX_OFFSET} m from the body or not"
             " finite; simulate it again with more substeps."
         )
-    left = _codec_of(folder, template).encode(whole.astype(np.int64))
+    residuals = _codec_of(folder, template).encode(integers.astype(np.int64))
     part = folder / f".{template}.part"
     shutil.rmtree(part, ignore_errors=True)
     store = ts.open(
@@ -210,11 +211,11 @@ def write_offsets(
             "driver": "zarr3",
             "kvstore": {"driver": "file", "path": str(part)},
             "metadata": {
-                "shape": list(left.shape),
+                "shape": list(residuals.shape),
                 "data_type": "uint32",
                 "chunk_grid": {
                     "name": "regular",
-                    "configuration": {"chunk_shape": list(left.shape)},
+                    "configuration": {"chunk_shape": list(residuals.shape)},
                 },
                 "codecs": [
                     {"name": "bytes", "configuration": {"endian": "little"}},
@@ -231,91 +232,92 @@ def write_offsets(
                 "attributes": {
                     **meta,
                     "unit": "m",
-                    "quantum": QUANTUM,
+                    "quantum": QUANTIZATION_STEP,
                     "frames": len(offsets),
-                    "sha256": hashlib.sha256(left.tobytes()).hexdigest(),
+                    "sha256": hashlib.sha256(residuals.tobytes()).hexdigest(),
                 },
             },
         },
         create=True,
     ).result()
-    store.write(left).result()
+    store.write(residuals).result()
     final = folder / template
     shutil.rmtree(final, ignore_errors=True)
     os.replace(part, final)
 
 
 def read_offsets(folder: pathlib.Path, template: str) -> Float[np.ndarray, "frames vertices 3"]:
-    """Offsets [m] of one garment of one action.
+    """Offsets [m] of one garment in one action.
 
     Raises:
-        FormatError: Damaged.
+        FormatError: The array is damaged.
     """
     path = folder / template
     codec, frames = _codec_of(folder, template), read_meta(folder, template).get("frames")
-    with _damage_told(path):
+    with _report_damage(path):
         spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(path)}}
         store = ts.open(spec, read=True).result()
-        # Before memory is asked for: a kilobyte may announce gigabytes of nothing.
+        # Checked before allocation: a kilobyte on disk may declare gigabytes of zeros.
         fits = store.shape == (3, len(codec.order), frames) and store.dtype == ts.uint32
-        if not fits or math.prod(store.shape) > _MOST:
-            raise ValueError("an array of another shape")
-        left = np.ascontiguousarray(store.read().result())
-    if hashlib.sha256(left.tobytes()).hexdigest() != read_meta(folder, template).get("sha256"):
+        if not fits or math.prod(store.shape) > _MAX_COORDINATES:
+            raise ValueError("unexpected shape or data type")
+        residuals = np.ascontiguousarray(store.read().result())
+    if hashlib.sha256(residuals.tobytes()).hexdigest() != read_meta(folder, template).get("sha256"):
         raise FormatError(
             f"{folder.name}/{template}: the checksum is wrong; delete that folder and build"
             " the dataset again, only this part will be simulated."
         )
-    return codec.decode(left).astype(np.float32) * np.float32(QUANTUM)
+    return codec.decode(residuals).astype(np.float32) * np.float32(QUANTIZATION_STEP)
 
 
 def read_meta(folder: pathlib.Path, template: str) -> dict[str, Any]:
-    """What was noted of one garment of one action.
+    """Metadata of one garment in one action.
 
     Raises:
-        FormatError: Damaged.
+        FormatError: The metadata is damaged.
     """
     path = folder / template / "zarr.json"
-    with _damage_told(path):
-        return _table(_table(json.loads(path.read_text()))["attributes"])
+    with _report_damage(path):
+        return _as_dict(_as_dict(json.loads(path.read_text()))["attributes"])
 
 
 def is_stored(folder: pathlib.Path, template: str) -> bool:
-    """Whether a garment of an action is there."""
+    """Whether a garment of an action is stored."""
     return (folder / template / "zarr.json").is_file()
 
 
 def write_action(folder: pathlib.Path, motion: Motion, split: str) -> None:
-    """The motion of an action and what split it is in.
+    """Writes the motion of an action and its split.
 
     Raises:
-        FormatError: Another motion lies there: its garments belong to that one.
+        FormatError: The folder holds another motion, which its garments belong to, or another
+            split.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    there = folder / "motion.npz"
-    if there.is_file():
-        before = load_motion(there)
-        pairs = ((before.rotations, motion.rotations), (before.root, motion.root))
+    motion_file = folder / "motion.npz"
+    if motion_file.is_file():
+        stored = load_motion(motion_file)
+        pairs = ((stored.rotations, motion.rotations), (stored.root, motion.root))
         same = all(a.shape == b.shape and np.allclose(a, b, atol=1e-4) for a, b in pairs)
-        if not same or before.fps != motion.fps:
+        if not same or stored.fps != motion.fps:
             raise FormatError(
-                f"{folder}: its motion isn't the one that is simulated now, by other files or"
+                f"{folder}: its motion isn't the one to simulate: it comes from other files or"
                 " another version. Delete that folder, or build into another one."
             )
     else:
-        save_motion(there, motion)
+        save_motion(motion_file, motion)
     note = folder / "action.json"
     if note.is_file() and _action_note(note)["split"] != split:
         raise FormatError(
-            f"{folder}: stored as '{_action_note(note)['split']}', now '{split}'. A set whose"
-            " splits changed has to be built anew: choose another folder."
+            f"{folder}: stored as '{_action_note(note)['split']}', now '{split}'. A"
+            " dataset whose splits changed must be rebuilt: choose another folder."
         )
-    with whole_file(note) as part:
+    with atomic_write(note) as part:
         part.write_text(json.dumps({"name": motion.name, "split": split}))
 
 
 def read_sequence(folder: str | pathlib.Path) -> Sequence:
-    """An action with every garment that has been simulated for it.
+    """Reads an action with every garment that has been simulated for it.
 
     Raises:
         FormatError: The folder doesn't hold an action.
@@ -326,7 +328,7 @@ def read_sequence(folder: str | pathlib.Path) -> Sequence:
         raise FormatError(f"{folder}: no action.json, not an action of a dataset.")
     info = _action_note(note)
     motion = load_motion(folder / "motion.npz")
-    # What begins with a dot is being written, or was when its process was killed.
+    # Names that begin with a dot are incomplete: in progress or interrupted.
     found = sorted(p.parent.name for p in folder.glob("[!.]*/zarr.json"))
     return Sequence(
         info["name"],
@@ -347,18 +349,18 @@ def list_sequences(root: str | pathlib.Path, split: str | None = None) -> list[p
 
 
 def _action_note(path: pathlib.Path) -> dict[str, str]:
-    with _damage_told(path):
-        told = json.loads(path.read_text())
-        return {"name": str(told["name"]), "split": str(told["split"])}
+    with _report_damage(path):
+        parsed = json.loads(path.read_text())
+        return {"name": str(parsed["name"]), "split": str(parsed["split"])}
 
 
 def log_build(root: str | pathlib.Path, line: dict[str, Any]) -> None:
-    """Adds a line to the log of a build: what took how long."""
+    """Appends a line to the build log: a job and its duration."""
     append_line(pathlib.Path(root) / _LOG, line)
 
 
 def read_log(root: str | pathlib.Path) -> list[dict[str, Any]]:
-    """The log of a build; a line cut by a kill is left out."""
+    """The lines of the build log; incomplete lines are dropped."""
     return read_lines(pathlib.Path(root) / _LOG)
 
 
@@ -367,7 +369,7 @@ def _unfinished(path: pathlib.Path) -> bool:
 
 
 def dataset_digest(root: str | pathlib.Path) -> tuple[str, int]:
-    """Checksum of all that a dataset is (times apart), and its bytes."""
+    """Checksum of a dataset's files (build log excluded), and their size in bytes."""
     root = pathlib.Path(root)
     total, size = hashlib.sha256(), 0
     files = (p for p in root.rglob("*") if p.is_file() and p.name != _LOG)

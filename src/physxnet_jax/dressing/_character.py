@@ -1,4 +1,4 @@
-"""A body of the user's own, animated elsewhere, in clothes."""
+"""Characters: animated meshes from other software, dressed by way of a registered body."""
 
 import dataclasses
 import pathlib
@@ -10,63 +10,65 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
-from ..body import Body, clothed_vertices, load_body, register_body
+from ..body import Body, clothed_vertices, load_body, register_body, skin_points
 from ..errors import MeshError
-from ..garment import Garment
-from ..geometry import each_frame
-from ..io import AnimatedMesh, read_character, smooth_normals
-from ..models import Wearable, skin_points
+from ..garment import Garment, SkinnedGarment
+from ..geometry import map_frames
+from ..io import AnimatedMesh, smooth_normals
 from ..motion import (
     BLOCK,
     Motion,
     body_animation,
-    follow_surface,
+    fit_motion,
     load_motion,
     padded_block,
     read_joint_map,
     resample,
 )
-from ._push_out import SkinPatch, faces_at_rest, push_out_of
+from ._blocks import PosedClip, resolve_clip_layers
+from ._character_file import read_character
+from ._dresser import Dresser
+from .postprocess import BodyCollider, faces_at_rest, resolve_collisions_with_skin
 
-# Skin whose leftover movement a garment vertex takes over: so many vertices, over so far [m].
-_SKIN, _WIDTH = 24, 0.03
-# Cloth deeper than this under the nearest skin is beneath another limb [m].
-_DEEPEST = 0.06
-# Skin that goes this far from where the joints take it isn't that skin [m].
-_STRAY = 0.15
-# Corners of a mesh stand no farther out of it than this [m].
-_RISE = 0.015
-# Triangles that are looked through for those near cloth; how far it slides at most [m].
-_LOOKED_THROUGH, _SLIDE = 40, 0.15
-# Frames that are looked at for how much of a garment is inside.
-_LOOKED_AT = 40
+# Skin vertices whose residuals a garment vertex averages, and the width of their weights [m].
+_NUM_NEAREST, _WEIGHT_WIDTH = 24, 0.03
+# Cloth deeper than this below the nearest skin belongs to another limb [m].
+_MAX_DEPTH = 0.06
+# Skin vertices with a larger residual are registered to another limb [m].
+_MAX_RESIDUAL = 0.15
+# Limit on the height of a coarse mesh's vertices above the registered surface [m].
+_MAX_RISE = 0.015
+# Nearest triangles examined for each vertex; maximum distance that cloth slides [m].
+_NUM_CANDIDATES, _MAX_SLIDE = 40, 0.15
+# Frames sampled for the share of a garment inside the character.
+_NUM_SAMPLED = 40
 
 
 @dataclasses.dataclass(frozen=True)
 class Character:
-    """A person of one's own: a mesh in motion and the body that moves as it does.
+    """An animated mesh and a body that follows its motion.
 
     Attributes:
-        mesh: The person [m], Y up.
-        fps: Frames a second.
-        body: The package's body in the person's proportions.
-        motion: How its joints turn to follow the person.
-        leftover: What skinning that body leaves between it and the person's surface [m],
-            shape [frames, 13380, 3]; zero where the surfaces don't meet.
-        surface: The body's vertices on the person's surface [m], shape likewise.
-        rise: How far corners of a coarse mesh stand out of the surface through those
+        mesh: The character's mesh [m], Y up.
+        fps: Frames per second.
+        body: The built-in body in the character's proportions.
+        motion: The motion with which that body follows the mesh.
+        residual: Offset from the skinned body to the character's surface [m], shape
+            [frames, 13380, 3]; zero where the surfaces don't correspond.
+        surface: The body's vertices on the character's surface [m], same shape.
+        rise: Height of the vertices of a coarse mesh above the surface through those
             vertices [m], shape [13380].
-        apart: Mean distance between the two, where clothes hang, fitted by shape and
-            pose alone [m].
-        missed: Share of the vertices there that found no surface.
-        notes: What was found out about the file.
+        apart: Mean distance between body and surface in clothed regions, after fitting
+            shape and pose alone [m].
+        missed: Share of vertices in clothed regions without a counterpart on the surface.
+        notes: Remarks on the file.
     """
 
     mesh: AnimatedMesh
     fps: float
     body: Body
     motion: Motion
-    leftover: Float[np.ndarray, "frames vertices 3"]
+    residual: Float[np.ndarray, "frames vertices 3"]
     surface: Float[np.ndarray, "frames vertices 3"]
     rise: Float[np.ndarray, " vertices"]
     apart: float
@@ -85,27 +87,28 @@ def load_character(
     joint_map: Mapping[str, str] | str | pathlib.Path | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Character:
-    """A person of one's own from a file, to be handed to `dress`.
+    """Loads a character from a file, as input of `dress`.
 
     Args:
         path: Animated glTF (skin or morph targets), USD, PC2 or MDD with its OBJ, or npz,
             see `read_character`.
-        fps: Frames a second.
-        source_fps: True rate of a file that doesn't say it, or says it wrongly: of
-            `motion`, where that is a file.
+        fps: Frames per second.
+        source_fps: True frame rate of a file that states none or a wrong one; that of
+            `motion`, if it is a file.
         mesh: Name of the body's mesh in the file.
         frames: Keep only this many frames.
-        motion: What moves the person's skin instead of the file's own animation: a clip,
-            or what `load_motion` takes. Of a rigged glTF or VRM, whose bones are known by
-            their names, by VRM or by `joint_map`.
-        joint_map: Body joint to the person's joint, or a file of them (`read_joint_map`).
-        progress: Called with a stage, steps done and steps in all.
+        motion: A clip, or what `load_motion` takes, that replaces the file's animation.
+            It requires a rigged glTF or VRM whose bones are identified by their names, by
+            VRM or by `joint_map`.
+        joint_map: Maps body joints to joints of the character, or a file that does
+            (`read_joint_map`).
+        progress: Called with the stage, the steps done and the total number of steps.
 
     Returns:
-        The person, with the body that follows it.
+        The character, with the body that follows it.
 
     Raises:
-        PhysXNetError: What can't be read, or no person whom the body fits.
+        PhysXNetError: The file can't be read, or the body doesn't fit its mesh.
     """
     if isinstance(motion, str | pathlib.Path):
         motion = load_motion(motion, fps=fps, source_fps=source_fps)
@@ -134,19 +137,19 @@ def make_character(
     bind: Float[np.ndarray, "vertices 3"] | None = None,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Character:
-    """A person of one's own from arrays.
+    """Makes a character from arrays.
 
-    The body is laid onto one pose (`register_body`): the bind pose, else frame 0, else a
-    frame with the arms out. From there it goes where the mesh goes.
+    The body is registered to one pose (`register_body`): the bind pose, else frame 0, else a
+    frame with the arms out. In all other frames it follows the mesh.
 
     Args:
-        mesh: The person, closed or not, of any topology [m].
-        fps: Frames a second.
-        bind: A pose with limbs apart, whether or not the clip has it [m].
-        progress: Called with a stage, steps done and steps in all.
+        mesh: The character's mesh, closed or not, of any topology [m].
+        fps: Frames per second.
+        bind: A pose with limbs apart, which needn't occur in the clip [m].
+        progress: Called with the stage, the steps done and the total number of steps.
 
     Raises:
-        MeshError: No pose fits the body.
+        MeshError: The body fits none of these poses.
     """
     base = load_body()
     mesh = dataclasses.replace(mesh, name="body")
@@ -166,25 +169,25 @@ def make_character(
     clothed = clothed_vertices(base)
     sure = found.sure & clothed
     for _ in range(2):
-        motion = follow_surface(body, surface, sure, fps, name=mesh.name)
-        leftover = surface - np.asarray(body_animation(body, motion))
-        # Skin that goes elsewhere was laid onto another limb: a thigh onto a hand beside it.
-        stray = sure & (np.linalg.norm(leftover, axis=2).max(axis=0) > _STRAY)
+        motion = fit_motion(body, surface, sure, fps, name=mesh.name)
+        residual = surface - np.asarray(body_animation(body, motion))
+        # A large residual means registration to another limb: of a thigh to a hand beside it.
+        stray = sure & (np.linalg.norm(residual, axis=2).max(axis=0) > _MAX_RESIDUAL)
         if not stray.any():
             break
         sure = sure & ~stray
-    leftover = np.where(sure[None, :, None], leftover, 0.0)
+    residual = np.where(sure[None, :, None], residual, 0.0)
     notes = (
-        f"the body lies {1e3 * float(found.distance[sure].mean()):.0f} mm from"
-        f" yours by shape and pose; the rest, and {_mm(leftover[:, clothed])} that skinning"
-        " leaves, is carried over",
+        f"shape and pose bring the body to {1e3 * float(found.distance[sure].mean()):.0f} mm from"
+        f" the mesh; this rest and the skinning residual of {_mm(residual[:, clothed])} are"
+        " added to the garments",
     )
     return Character(
         mesh,
         fps,
         body,
         motion,
-        leftover.astype(np.float32),
+        residual.astype(np.float32),
         surface,
         _corners(body, mesh.positions, surface),
         float(found.distance[sure].mean()),
@@ -198,14 +201,16 @@ def _corners(
     positions: Float[np.ndarray, "frames points 3"],
     surface: Float[np.ndarray, "frames vertices 3"],
 ) -> Float[np.ndarray, " vertices"]:
-    """How far a person's own vertices stand above the surface through the body's [m]."""
-    frames = np.linspace(0, len(positions) - 1, _LOOKED_AT // 4).astype(int)
+    """Height of a mesh's vertices above the surface through the body's vertices [m]."""
+    frames = np.linspace(0, len(positions) - 1, _NUM_SAMPLED // 4).astype(int)
     normals = smooth_normals(surface[frames], np.asarray(body.rest_mesh().faces))
     out = np.zeros(surface.shape[1], np.float32)
     for k, f in enumerate(frames):
         distance, near = map(np.asarray, KDTree(surface[f]).query(positions[f]))
         height = np.einsum("vc,vc->v", positions[f] - surface[f, near], normals[k, near])
-        np.maximum.at(out, near, np.where(distance < 2 * _RISE, height, 0.0).clip(0.0, _RISE))
+        np.maximum.at(
+            out, near, np.where(distance < 2 * _MAX_RISE, height, 0.0).clip(0.0, _MAX_RISE)
+        )
     return out
 
 
@@ -214,131 +219,164 @@ def _mm(gap: np.ndarray) -> str:
 
 
 def _poses(positions: np.ndarray, bind: np.ndarray | None) -> list[np.ndarray]:
-    """Poses in which limbs may be apart, the likeliest first."""
+    """Poses to register the body to, those most likely to have limbs apart first."""
     first = [positions[0]] if bind is None else [bind, positions[0]]
-    breadth = np.ptp(positions[:, :, 0], axis=1) * np.ptp(positions[:, :, 2], axis=1)
-    widest = int(np.argmax(breadth))
+    extent = np.ptp(positions[:, :, 0], axis=1) * np.ptp(positions[:, :, 2], axis=1)
+    widest = int(np.argmax(extent))
     return first + ([positions[widest]] if widest else [])
 
 
-def on_character(garment: Garment, character: Character) -> Garment:
-    """A garment modelled on the package's body, carried onto the person's proportions."""
+def bind_to_character(garment: Garment, character: Character) -> Garment:
+    """Transfers a garment from the built-in body to the character's proportions."""
     rest = character.body.rest_vertices(character.body.default_shape())
     mesh = dataclasses.replace(garment.mesh, vertices=garment.rest_vertices(rest))
     return dataclasses.replace(garment, mesh=mesh)
 
 
-def follow_leftover(
+def apply_residual(
     garment: Garment,
     character: Character,
     positions: Float[np.ndarray, "frames vertices 3"],
 ) -> Float[np.ndarray, "frames vertices 3"]:
-    """A garment on the person's own surface instead of on the skinned body.
+    """Moves a garment from the skinned body onto the character's surface.
 
     Args:
-        garment: The garment, from `on_character`.
-        character: The person.
-        positions: Of the garment on the skinned body [m].
+        garment: The garment, from `bind_to_character`.
+        character: The character.
+        positions: Positions of the garment on the skinned body [m].
 
     Returns:
-        Positions [m]: each vertex moved as the skin near it is.
+        Positions [m], each displaced by the residual of the nearby skin.
     """
     rest = np.asarray(character.body.rest_vertices(character.body.default_shape()))
     rows = np.flatnonzero(clothed_vertices(character.body))
     points = np.asarray(garment.mesh.vertices)
-    distance, near = map(np.asarray, KDTree(rest[rows]).query(points, k=_SKIN))
-    weight = np.exp(-0.5 * ((distance - distance[:, :1]) / _WIDTH) ** 2)
+    distance, near = map(np.asarray, KDTree(rest[rows]).query(points, k=_NUM_NEAREST))
+    weight = np.exp(-0.5 * ((distance - distance[:, :1]) / _WEIGHT_WIDTH) ** 2)
     weight = (weight / weight.sum(axis=1, keepdims=True)).astype(np.float32)
     out = np.array(positions, np.float32)
-    for k in range(_SKIN):
-        out += weight[:, k, None] * character.leftover[: len(out), rows[near[:, k]]]
+    for k in range(_NUM_NEAREST):
+        out += weight[:, k, None] * character.residual[: len(out), rows[near[:, k]]]
     return out
 
 
-def clear_of_character(
-    patch: SkinPatch,
-    wearable: Wearable,
+def dress_character(
+    character: Character,
+    dresser: Dresser,
+    clip: PosedClip,
+    positions: dict[str, np.ndarray],
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Moves garments from the skinned body onto the character's surface.
+
+    Args:
+        character: The character.
+        dresser: A dresser with garments from `bind_to_character`.
+        clip: The motion.
+        positions: Garments by name on the skinned body [m].
+
+    Returns:
+        Garments on the surface [m], before and after resolving collisions with it.
+    """
+    raw = {g.name: apply_residual(g, character, positions[g.name]) for g in dresser.garments}
+    if dresser.colliders is None:
+        return raw, raw
+    world, shift = clip.rotations, clip.translations
+    out = {
+        w.name: resolve_character_collisions(c, w, character, raw[w.name], world, shift)
+        for c, w in zip(dresser.colliders, dresser.worn, strict=True)
+    }
+    # Resolving collisions with the skin may move a garment through the one over it.
+    return raw, resolve_clip_layers(dresser.layers or (), out)
+
+
+def resolve_character_collisions(
+    collider: BodyCollider,
+    worn: SkinnedGarment,
     character: Character,
     positions: Float[np.ndarray, "frames vertices 3"],
     world: Float[np.ndarray, "frames joints 3 3"],
     shift: Float[np.ndarray, "frames joints 3"],
 ) -> Float[np.ndarray, "frames vertices 3"]:
-    """A garment moved out of the person's own surface, see `push_out`.
+    """Resolves collisions of a garment with the character's surface (`resolve_collisions`).
 
-    The surface is looked for where the garment is, not where it lay at rest: on knees and
-    elbows that another rig bends, cloth slides.
+    Candidate triangles are searched near the garment in each frame, not near its rest
+    position, because cloth slides over knees and elbows that another rig bends.
 
     Args:
-        patch: The skin near each of its vertices.
-        wearable: The garment at rest.
-        character: The person.
-        positions: Of the garment [m].
+        collider: The skin near each garment vertex.
+        worn: The garment at rest.
+        character: The character.
+        positions: Positions of the garment [m].
         world: World rotations of the joints.
         shift: World translations of the joints [m].
     """
     frames = len(positions)
-    leftover = character.leftover[:frames, np.asarray(patch.used)]
+    residual = character.residual[:frames, np.asarray(collider.used)]
     lying = np.arange(positions.shape[1])
-    lying = lying if patch.skirt is None else np.asarray(patch.skirt.lying)
-    still = np.asarray(wearable.rest)[lying]
-    rise = character.rise[np.asarray(patch.used)][np.asarray(patch.faces)].max(axis=1)
-    least = np.array(patch.least)
+    lying = lying if collider.skirt is None else np.asarray(collider.skirt.lying)
+    rest_points = np.asarray(worn.rest)[lying]
+    rise = character.rise[np.asarray(collider.used)][np.asarray(collider.faces)].max(axis=1)
+    least = np.array(collider.least)
     least += np.quantile(rise, 0.95).astype(least.dtype)
-    least[lying] = np.asarray(patch.least)[lying] + rise[np.asarray(faces_at_rest(patch))].max(
-        axis=1
-    )
-    most = np.maximum(np.asarray(patch.most), least)
-    patch = dataclasses.replace(patch, least=jnp.asarray(least), most=jnp.asarray(most))
+    least[lying] = np.asarray(collider.least)[lying] + rise[
+        np.asarray(faces_at_rest(collider))
+    ].max(axis=1)
+    most = np.maximum(np.asarray(collider.most), least)
+    collider = dataclasses.replace(collider, least=jnp.asarray(least), most=jnp.asarray(most))
     blocks = []
     for at in range(0, frames, BLOCK):
-        x, r, t, left = (padded_block(v, at, 0) for v in (positions, world, shift, leftover))
-        skin = np.asarray(_skin_block(patch, jnp.asarray(r), jnp.asarray(t), jnp.asarray(left)))
-        near = np.stack([_near(patch, still, s, p[lying]) for s, p in zip(skin, x, strict=True)])
-        out = _clear_block(patch, *(jnp.asarray(v) for v in (x, r, skin, near)))
+        x, r, t, offset = (padded_block(v, at, 0) for v in (positions, world, shift, residual))
+        skin = np.asarray(
+            _skin_block(collider, jnp.asarray(r), jnp.asarray(t), jnp.asarray(offset))
+        )
+        near = np.stack(
+            [_near(collider, rest_points, s, p[lying]) for s, p in zip(skin, x, strict=True)]
+        )
+        out = _resolve_block(collider, *(jnp.asarray(v) for v in (x, r, skin, near)))
         blocks.append(np.asarray(out))
     return np.concatenate(blocks)[:frames]
 
 
 def _near(
-    patch: SkinPatch,
-    still: Float[np.ndarray, "lying 3"],
+    collider: BodyCollider,
+    rest_points: Float[np.ndarray, "lying 3"],
     skin: Float[np.ndarray, "skin 3"],
     points: Float[np.ndarray, "lying 3"],
 ) -> Int[np.ndarray, "lying k"]:
-    """The nearest triangles that aren't another limb's: those lay farther off at rest."""
-    faces, usual = np.asarray(patch.faces), np.asarray(faces_at_rest(patch))
-    count = min(_LOOKED_THROUGH, len(faces))
+    """The nearest triangles, without those of other limbs, which are farther away at rest."""
+    faces, rest_candidates = np.asarray(collider.faces), np.asarray(faces_at_rest(collider))
+    count = min(_NUM_CANDIDATES, len(faces))
     found = np.asarray(KDTree(skin[faces].mean(axis=1)).query(points, k=count)[1])
-    place = np.asarray(patch.rest)[faces].mean(axis=1)
-    own = np.linalg.norm(place[found] - still[:, None], axis=2) < _SLIDE
-    first = np.argsort(~own, axis=1, kind="stable")[:, : usual.shape[1]]
-    found, own = (np.take_along_axis(v, first, axis=1) for v in (found, own))
-    return np.where(own, found, usual).astype(np.int32)
+    centroids = np.asarray(collider.rest)[faces].mean(axis=1)
+    same_limb = np.linalg.norm(centroids[found] - rest_points[:, None], axis=2) < _MAX_SLIDE
+    first = np.argsort(~same_limb, axis=1, kind="stable")[:, : rest_candidates.shape[1]]
+    found, same_limb = (np.take_along_axis(v, first, axis=1) for v in (found, same_limb))
+    return np.where(same_limb, found, rest_candidates).astype(np.int32)
 
 
 @jax.jit
-def _skin_block(patch: SkinPatch, world: Array, shift: Array, leftover: Array) -> Array:
-    def one(r: Array, t: Array, left: Array) -> Array:
-        return skin_points(patch.rest, patch.weights, r, t)[0] + left
+def _skin_block(collider: BodyCollider, world: Array, shift: Array, residual: Array) -> Array:
+    def one(r: Array, t: Array, offset: Array) -> Array:
+        return skin_points(collider.rest, collider.weights, r, t)[0] + offset
 
-    return jax.vmap(one)(world, shift, leftover)
+    return jax.vmap(one)(world, shift, residual)
 
 
 @jax.jit
-def _clear_block(
-    patch: SkinPatch, positions: Array, world: Array, skin: Array, near: Array
+def _resolve_block(
+    collider: BodyCollider, positions: Array, world: Array, skin: Array, near: Array
 ) -> Array:
     def one(x: Array, r: Array, s: Array, k: Array) -> Array:
-        return push_out_of(patch, x, r, s, k)
+        return resolve_collisions_with_skin(collider, x, r, s, k)
 
-    return each_frame(one, positions, world, skin, near)
+    return map_frames(one, positions, world, skin, near)
 
 
-def inside_character(
+def character_penetration(
     character: Character, positions: Float[np.ndarray, "frames vertices 3"]
 ) -> float:
-    """Share of a garment's vertices below the person's skin near them, over the clip."""
-    frames = [int(f) for f in np.linspace(0, len(positions) - 1, _LOOKED_AT)]
+    """Mean share of a garment's vertices below the character's nearby skin, over the clip."""
+    frames = [int(f) for f in np.linspace(0, len(positions) - 1, _NUM_SAMPLED)]
     rows = np.flatnonzero(clothed_vertices(character.body))
     faces = np.asarray(character.body.rest_mesh().faces)
     normals = smooth_normals(character.surface[frames], faces)[:, rows]
@@ -347,5 +385,5 @@ def inside_character(
         skin = character.surface[f, rows]
         near = np.asarray(KDTree(skin).query(positions[f])[1])
         height = np.einsum("vc,vc->v", positions[f] - skin[near], normals[k, near])
-        share.append(((height < 0) & (height > -_DEEPEST)).mean())
+        share.append(((height < 0) & (height > -_MAX_DEPTH)).mean())
     return float(np.mean(share))

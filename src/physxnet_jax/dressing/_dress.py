@@ -1,40 +1,38 @@
-"""From motion and garments to dressed, animated meshes."""
+"""Dresses a motion in garments and returns animated meshes."""
 
 import dataclasses
 import pathlib
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._environment import free_programs
+from .._environment import clear_caches_if_full
 from ..body import Body, load_body
 from ..errors import PhysXNetError
 from ..garment import Garment
-from ..geometry import Smoothing, make_springs
-from ..io import DEFAULT, AnimatedMesh, load_predictor
-from ..models import Predictor, Wearable, fold_batch_norm, make_surface, make_wearable
-from ..motion import Motion, before_transforms, clip_transforms, sudden_turns
-from ..simulation import ACCURACY
-from ..uv import Binding, Transference, bind
-from ._blocks import inside_shares, lead_frames, lift_clip, predict_clip, simulate_clip
+from ..io import AnimatedMesh
+from ..models import BoundGarment, Predictor, load_predictor
+from ..motion import BLOCK, Motion, prepare_motion, slice_motion, sudden_turns
+from ..simulation import Rollout
+from ._blocks import Block, PosedClip, infer_clip, inside_shares, pose_clip
 from ._character import (
     Character,
-    clear_of_character,
-    follow_leftover,
-    inside_character,
-    on_character,
+    bind_to_character,
+    character_penetration,
+    dress_character,
 )
-from ._layers import make_layers
-from ._meshes import Wear, animated_meshes, worn_garments
-from ._push_out import make_patch, tuck_in
+from ._dresser import Dresser, dress_garments, move_to_body
+from ._inference import Inference
+from ._meshes import Wear, animated_meshes, resolve_garments
+from ._simulate import Simulation, build_scene, run_simulation
 from ._stages import Stage, Watch
-from ._wanted_clip import cut_clip, wanted_clip
+from .postprocess import prepare_collisions
 
 Method = Literal["network", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "lbs", "simulate")
+Progress = Callable[[str, int, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,19 +41,21 @@ class DressedClip:
 
     Attributes:
         meshes: The body (unless left out) and the garments in the order worn.
-        fps: Frames a second.
-        stages: Where the time went.
-        hit_rate: For each garment, share of vertices whose ray met the body; None
+        fps: Frames per second.
+        stages: Time of each stage.
+        hit_rate: For each garment, share of vertices whose ray hit the body; None
             where no ray is cast (lbs, simulate).
-        fallbacks: For each garment, vertices bound by the closest point; likewise.
-        inside_raw: For each garment, share of vertices below the skin near them, as
-            computed. Another limb's skin isn't looked at.
-        inside: The same in the result, after the push-out; for a `Character` against the
-            person's own surface, from which cloth is then moved.
-        method: How the cloth was made.
-        notes: What the reader should know about it.
-        worst: For each garment by name the frame in which most of it is inside the body,
-            and how much; empty on a person of one's own.
+        fallbacks: For each garment, number of vertices bound by the closest point; None
+            likewise.
+        inside_raw: For each garment, share of vertices below the nearby skin before
+            collision resolution. Skin of another limb is ignored.
+        inside: The same in the result; for a `Character` measured against the character's
+            surface.
+        method: How the cloth was computed.
+        notes: Warnings and remarks.
+        worst: For each garment, the frame with the largest share inside the body, and that
+            share; empty for a `Character`.
+        rollout: The simulation with its diagnostics; None for other methods.
     """
 
     meshes: tuple[AnimatedMesh, ...]
@@ -68,6 +68,7 @@ class DressedClip:
     method: str
     notes: tuple[str, ...] = ()
     worst: dict[str, tuple[int, float]] = dataclasses.field(default_factory=dict)
+    rollout: Rollout | None = None
 
     @property
     def garments(self) -> tuple[AnimatedMesh, ...]:
@@ -85,220 +86,239 @@ def dress(
     wear: Wear = ("top", "bottom"),
     *,
     method: Method = "network",
-    accuracy: str = "standard",
+    inference: Inference | None = None,
+    simulation: Simulation | None = None,
     fps: float | int = 30.0,
     start: float = 0.0,
     frames: int | None = None,
-    weights: str | pathlib.Path | Predictor = DEFAULT,
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
     include_body: bool = True,
-    push_out: bool = True,
-    progress: Callable[[str, int, int], None] | None = None,
+    progress: Progress | None = None,
+    on_block: Callable[[Block], None] | None = None,
 ) -> DressedClip:
     """Dresses a moving person.
 
     Args:
-        motion: A motion, a motion file, the name of a built-in clip, or a person of one's
-            own (`load_character`), who brings body, shape and frame rate along.
-        wear: Garments, garment files or template names. Tops go over dresses, dresses over
-            trousers; of two of one kind the first is beneath.
-        method: ``network`` (packaged weights), ``lbs`` (skinning alone, the baseline)
-            or ``simulate`` (the cloth simulator, the network's teacher).
-        accuracy: Of ``simulate``: ``draft``, ``standard`` or ``fine``.
-        fps: Frames a second of the result.
-        start: Where in the motion to begin [s].
+        motion: A motion, a motion file, the name of a built-in clip, or a `Character`, which
+            defines body, shape and frame rate.
+        wear: Garments, garment files or template names, with options as in
+            ``coat.obj:as=top,fabric=wool`` (see `Wear`).
+        method: ``network``, ``lbs`` (skinning alone) or ``simulate`` (the cloth simulator).
+        inference: Weights and post-processing of ``network`` and ``lbs``; ``collisions`` also
+            apply to cloth simulated on a character.
+        simulation: Options of ``simulate``.
+        fps: Frames per second of the result.
+        start: Start time within the motion [s].
         frames: Keep only this many frames.
-        weights: Name or folder of network weights, or a predictor.
         body: The body; the built-in one by default.
         shape: Shape parameters; the default shape if omitted.
-        include_body: Put the body's mesh into the result.
-        push_out: Push vertices that end inside the body onto it, and garments off those
-            beneath them (network and lbs; on a character's skin simulated cloth, too).
-        progress: Called with a stage, frames done and frames in all.
+        include_body: Whether the result contains the body's mesh.
+        progress: Called with the stage, the frames done and the total number of frames.
+        on_block: Called with each finished block of ``network`` and ``lbs``.
 
     Returns:
-        Animated meshes with the time of every stage.
+        Animated meshes, with the time of each stage.
 
     Raises:
-        PhysXNetError: Anything that can't be read, bound or worn; the text says why.
+        PhysXNetError: An input can't be read, bound or worn; the message states the reason.
 
     Example:
         >>> clip = dress("walk", ["bottom"], method="lbs", frames=2)
         >>> [m.name for m in clip.meshes]
         ['body', 'bottom']
     """
+    stages: list[Stage] = []
+    inference = Inference() if inference is None else inference
+    simulation = Simulation() if simulation is None else simulation
+    _check_options(method, motion, body, shape, start)
+    clear_caches_if_full()
+    person = _load_person(motion, body, shape, fps, start, frames, stages)
+    garments, notes = _load_garments(wear, person, method, stages)
+    dresser = _make_dresser(garments, person, method, inference, stages)
+    if method == "simulate":
+        cloth = _simulate_cloth(garments, person, simulation, stages, progress)
+    else:
+        cloth = _infer_cloth(dresser, person.clip, stages, progress, on_block)
+    return _assemble_clip(dresser, person, cloth, method, include_body, notes, stages)
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Person:
+    """The person to dress: a character, or a body with shape parameters."""
+
+    body: Body
+    shape: Float[Array, " shapes"] | None
+    clip: PosedClip
+    character: Character | None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Cloth:
+    """Garments by name, before and after collision resolution [m]."""
+
+    raw: dict[str, np.ndarray]
+    positions: dict[str, np.ndarray]
+    rollout: Rollout | None = None
+
+
+def _check_options(method: str, motion: Any, body: Any, shape: Any, start: float) -> None:
     if method not in METHODS:
         raise PhysXNetError(f"No method '{method}'; there are {', '.join(METHODS)}.")
-    if accuracy not in ACCURACY:
-        raise PhysXNetError(f"No accuracy '{accuracy}'; there are {', '.join(ACCURACY)}.")
-    person = motion if isinstance(motion, Character) else None
-    if person is not None:
+    if isinstance(motion, Character):
         if body is not None or shape is not None:
-            raise PhysXNetError("A character has a body of its own: leave out body and shape.")
+            raise PhysXNetError("A character has its own body: leave out body and shape.")
         if start:
-            raise PhysXNetError("A character begins where its file does: leave out start.")
-        motion, body, fps = person.motion, person.body, person.fps
-    # Who dresses a folder of garments compiles for each of them.
-    free_programs()
-    stages: list[Stage] = []
-    watch = Watch(stages)
-    body = load_body() if body is None else body
-    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
-    with watch("motion"):
-        assert not isinstance(motion, Character)
-        whole = wanted_clip(motion, fps=fps, body=body, shape=shape)
-        clip, past = cut_clip(whole, start, frames)
-        fault = sudden_turns(body, clip)
-        world, shift = clip_transforms(body, rest, clip)
-    with watch("garments"):
-        # A character's clothes are modelled on the body as it is, and carried over.
-        on = body if person is None else load_body()
-        garments, notes = worn_garments(wear, on)
-        if person is not None:
-            garments = [on_character(g, person) for g in garments]
-        else:
-            garments = [as_on(body, g) for g in garments]
-    hits: dict[str, float | None] = {g.name: None for g in garments}
-    fallbacks: dict[str, int | None] = {g.name: None for g in garments}
-    predictor = None
-    if method == "network":
-        with watch("weights"):
-            known = weights if isinstance(weights, Predictor) else load_predictor(weights)
-            predictor = fold_batch_norm(known)
-            predictor = fit_surface(predictor, body, rest)
-        with watch("binding"):
-            wearables = [bound_wearable(predictor, body, rest, g) for g in garments]
-        for w in wearables:
-            hits[w.name] = float(w.binding.hit_rate)
-            fallbacks[w.name] = int(w.binding.fallbacks)
-    else:
-        wearables = [unbound_wearable(body, rest, g) for g in garments]
-    patches = tuck_in(
-        [make_patch(body, rest, w, g.mesh) for w, g in zip(wearables, garments, strict=True)],
-        wearables,
-    )
-    layers = make_layers(body, rest, wearables, garments)
-    if method == "simulate":
-        positions = simulate_clip(garments, clip, body, shape, accuracy, stages, progress)
-        inside_raw = None
-    else:
-        before = before_transforms(body, rest, clip, lead_frames(predictor), past)
-        positions, inside_raw = predict_clip(
-            predictor,
-            wearables,
-            patches,
-            layers,
-            world,
-            shift,
-            before,
-            clip.fps,
-            push_out,
-            stages,
-            progress,
+            raise PhysXNetError("A character starts at its first frame: leave out start.")
+
+
+def _load_person(
+    motion: Motion | Character | str | pathlib.Path,
+    body: Body | None,
+    shape: Float[Array, " shapes"] | None,
+    fps: float | int,
+    start: float,
+    frames: int | None,
+    stages: list[Stage],
+) -> _Person:
+    character = motion if isinstance(motion, Character) else None
+    with Watch(stages)("motion"):
+        if isinstance(motion, Character):
+            body, fps, motion = motion.body, motion.fps, motion.motion
+        body = load_body() if body is None else body
+        whole = prepare_motion(motion, fps=fps, body=body, shape=shape)
+        part, past = slice_motion(whole, start, frames)
+        rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+        clip = pose_clip(body, rest, part, past)
+    return _Person(body=body, shape=shape, clip=clip, character=character)
+
+
+def _load_garments(
+    wear: Wear, person: _Person, method: Method, stages: list[Stage]
+) -> tuple[list[Garment], tuple[str, ...]]:
+    character = person.character
+    with Watch(stages)("garments"):
+        # Garments are modelled on the built-in body, then transferred to the character.
+        garments, notes = resolve_garments(wear, person.body if character is None else load_body())
+        if character is not None:
+            return [bind_to_character(g, character) for g in garments], notes
+        return [move_to_body(person.body, g) for g in garments], notes
+
+
+def _make_dresser(
+    garments: list[Garment],
+    person: _Person,
+    method: Method,
+    inference: Inference,
+    stages: list[Stage],
+) -> Dresser:
+    if method == "network" and not isinstance(inference.weights, Predictor):
+        with Watch(stages)("weights"):
+            weights = load_predictor(inference.weights)
+            inference = dataclasses.replace(inference, weights=weights)
+    with Watch(stages)("binding"):
+        return dress_garments(
+            garments,
+            method="network" if method == "network" else "lbs",
+            inference=inference,
+            body=person.body,
+            shape=person.shape,
         )
-    each = {
-        w.name: inside_shares(p, positions[w.name], world, shift)
-        for w, p in zip(wearables, patches, strict=True)
-    }
-    inside = {name: float(shares.mean()) for name, shares in each.items()}
-    worst = {name: (int(x.argmax()), float(x.max())) for name, x in each.items()}
-    with watch("body"):
-        if person is not None:
-            positions = {g.name: follow_leftover(g, person, positions[g.name]) for g in garments}
-            # Both against the skin that is seen.
-            inside_raw = {g.name: inside_character(person, positions[g.name]) for g in garments}
-            if push_out:
-                positions = {
-                    w.name: clear_of_character(p, w, person, positions[w.name], world, shift)
-                    for w, p in zip(wearables, patches, strict=True)
-                }
-                # What was moved off the person's skin may have moved through what is over it.
-                positions = lift_clip(layers, wearables, positions)
-            inside = {g.name: inside_character(person, positions[g.name]) for g in garments}
-            worst = {}
-        meshes = animated_meshes(body, clip, shape, garments, positions, include_body)
-        if person is not None and include_body:
-            whole = dataclasses.replace(
-                person.mesh, positions=person.mesh.positions[: clip.num_frames]
+
+
+def _simulate_cloth(
+    garments: list[Garment],
+    person: _Person,
+    simulation: Simulation,
+    stages: list[Stage],
+    progress: Progress | None,
+) -> _Cloth:
+    scene = build_scene(garments, person.body, person.shape, simulation)
+    rollout = run_simulation(
+        scene, person.clip.motion, simulation, progress=progress, stages=stages
+    )
+    named = dict(zip([g.name for g in scene.garments], rollout.positions, strict=True))
+    cloth = {g.name: named[g.name] for g in garments}
+    return _Cloth(raw=cloth, positions=cloth, rollout=rollout)
+
+
+def _infer_cloth(
+    dresser: Dresser,
+    clip: PosedClip,
+    stages: list[Stage],
+    progress: Progress | None,
+    on_block: Callable[[Block], None] | None,
+) -> _Cloth:
+    name = "skinning" if dresser.predictor is None else "network"
+    blocks: list[Block] = []
+    for block in infer_clip(dresser, clip):
+        blocks.append(block)
+        if on_block is not None:
+            on_block(block)
+        if progress is not None:
+            progress(name, min(block.start + BLOCK, clip.num_frames), clip.num_frames)
+    times = [b.milliseconds for b in blocks]
+    warm = float(np.median(times[1:])) / BLOCK if len(times) > 1 else None
+    stages.append(Stage(name, times[0], warm))
+    names = [w.name for w in dresser.worn]
+    return _Cloth(
+        raw={n: np.concatenate([b.raw[n] for b in blocks]) for n in names},
+        positions={n: np.concatenate([b.positions[n] for b in blocks]) for n in names},
+    )
+
+
+def _assemble_clip(
+    dresser: Dresser,
+    person: _Person,
+    cloth: _Cloth,
+    method: Method,
+    include_body: bool,
+    notes: tuple[str, ...],
+    stages: list[Stage],
+) -> DressedClip:
+    """Assembles the result and measures the share of each garment inside the body."""
+    character, clip = person.character, person.clip
+    positions, worst = cloth.positions, {}
+    with Watch(stages)("body"):
+        if character is not None:
+            raw, positions = dress_character(character, dresser, clip, positions)
+            inside_raw, inside = (
+                {n: character_penetration(character, x) for n, x in part.items()}
+                for part in (raw, positions)
             )
-            meshes = (whole, *meshes[1:])
+        else:
+            colliders = dresser.colliders
+            if colliders is None:
+                colliders = prepare_collisions(dresser.outfit, Inference(collisions=True)) or ()
+            inside_raw, inside = {}, {}
+            for w, c in zip(dresser.worn, colliders, strict=True):
+                shares = inside_shares(c, positions[w.name], clip)
+                inside[w.name] = inside_raw[w.name] = float(shares.mean())
+                worst[w.name] = (int(shares.argmax()), float(shares.max()))
+                if cloth.raw is not cloth.positions and dresser.colliders is not None:
+                    inside_raw[w.name] = float(inside_shares(c, cloth.raw[w.name], clip).mean())
+        meshes = animated_meshes(
+            person.body, clip.motion, person.shape, dresser.garments, positions, include_body
+        )
+        if character is not None and include_body:
+            moving = character.mesh.positions[: clip.num_frames]
+            meshes = (dataclasses.replace(character.mesh, positions=moving), *meshes[1:])
+    fault = sudden_turns(person.body, clip.motion)
+    bound = {w.name: w.binding if isinstance(w, BoundGarment) else None for w in dresser.worn}
     return DressedClip(
         meshes,
-        clip.fps,
+        clip.motion.fps,
         tuple(stages),
-        hits,
-        fallbacks,
-        inside if inside_raw is None else inside_raw,
+        {n: None if b is None else float(b.hit_rate) for n, b in bound.items()},
+        {n: None if b is None else int(b.fallbacks) for n, b in bound.items()},
+        inside_raw,
         inside,
         method,
         (
             *(() if fault is None else (fault,)),
-            *(() if person is None else person.notes),
+            *(() if character is None else character.notes),
             *notes,
         ),
         worst,
-    )
-
-
-def fit_surface(predictor: Predictor, body: Body, rest: Float[Array, "all 3"]) -> Predictor:
-    """The predictor with its texels on a body of a shape.
-
-    Args:
-        predictor: Of any shape.
-        body: The body.
-        rest: `Body.rest_vertices` of the shape [m].
-    """
-    surface = make_surface(predictor.atlas, body, rest, predictor.surface.valid)
-    return dataclasses.replace(predictor, surface=surface)
-
-
-def as_on(body: Body, garment: Garment) -> Garment:
-    """A garment with its mesh where it lies on this body at rest.
-
-    Templates come on the built-in one, whatever body they are carried by.
-    """
-    if body is load_body():
-        return garment
-    vertices = garment.rest_vertices(body.rest_vertices(body.default_shape()))
-    return dataclasses.replace(garment, mesh=garment.mesh.replace(vertices=vertices))
-
-
-def bound_wearable(
-    predictor: Predictor, body: Body, rest: Float[Array, "all 3"], garment: Garment
-) -> Wearable:
-    """A garment bound to a predictor's atlas, on a body shape.
-
-    Raises:
-        PhysXNetError: The predictor has no decoder for the garment's template.
-    """
-    if garment.template not in predictor.config.templates:
-        raise PhysXNetError(
-            f"{garment.name}: the weights have no decoder for '{garment.template}', only"
-            f" {', '.join(predictor.config.templates)}. Use other weights or --method lbs."
-        )
-    # Bound on the default shape, where garments are modelled; carried to others.
-    base = body.rest_vertices(body.default_shape())
-    tied = bind(predictor.atlas, body, base, garment, predictor.surface.valid[garment.template])
-    return make_wearable(body, rest, garment, tied)
-
-
-def unbound_wearable(body: Body, rest: Float[Array, "all 3"], garment: Garment) -> Wearable:
-    """A garment for skinning alone, tied to no atlas."""
-    n = garment.num_vertices
-    rows = Transference(jnp.zeros((n, 3), jnp.int32), jnp.zeros((n, 3)), jnp.zeros((n,), bool))
-    count = jnp.zeros((), jnp.int32)
-    texel = jnp.zeros((n, 4), jnp.int32)
-    none = Binding(rows, texel, jnp.zeros((n, 4)), jnp.ones(()), count, count)
-    worn = garment.rest_vertices(rest)
-    return Wearable(
-        worn,
-        garment.skin,
-        none,
-        worn,
-        garment.skin,
-        Smoothing(()),
-        make_springs(np.asarray(worn), np.asarray(garment.mesh.faces)),
-        garment.template,
-        garment.name,
+        cloth.rollout,
     )

@@ -1,4 +1,4 @@
-"""A dresser as one file that runs with jax alone, without this package."""
+"""Exports a dresser as a serialised JAX function that runs without this package."""
 
 import hashlib
 import json
@@ -13,25 +13,26 @@ from jax import export
 
 from ..data import CARD
 from ..errors import MissingDependencyError, PhysXNetError
-from ..files import whole_file
-from ..io import read_card
-from ._dresser import Dresser, clothe
+from ..files import atomic_write
+from ..models import read_card
+from ._clothe import clothe
+from ._dresser import Dresser
 
 EXPORTED = ("dresser.jaxexport", "garments.npz", "card.json", "dress.py")
 """Files of an export."""
 
 _PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
-_LOADER = '''"""Clothes from joint rotations: needs jax, numpy and flatbuffers, nothing else.
+_LOADER = '''"""Garments from joint rotations; needs only jax, numpy and flatbuffers.
 
 >>> dress = load(".")                             # doctest: +SKIP
 >>> cloth, ok = dress(rotations, root)            # doctest: +SKIP
 
 rotations: [frames, joints, 4], unit quaternions wxyz relative to the parent joint; root:
-[frames, 3] in metres, Y up; both float32, card.json names the joints and the rate that
-frames must have. Returns a dictionary of vertices [frames, vertices, 3] in metres, and
-which frames are finite; garments.npz holds the triangles. Any number of frames; each new
-number compiles once.
+[frames, 3] in metres, Y up; both float32. card.json lists the joints and the required
+frame rate. Returns a dictionary of vertices [frames, vertices, 3] in metres, and which
+frames are finite. garments.npz holds the triangles. The number of frames is arbitrary;
+each new number compiles once.
 """
 
 import hashlib
@@ -60,22 +61,22 @@ def export_dresser(
     platforms: tuple[str, ...] = ("cpu", "cuda"),
     name: str = "",
 ) -> list[pathlib.Path]:
-    """Writes `clothe` of a dresser as StableHLO, for any number of frames.
+    """Exports `clothe` of a dresser as StableHLO, for any number of frames.
 
     Args:
-        folder: Where the files go, see `EXPORTED`.
-        dresser: The clothes.
-        fps: Frames a second that it will be asked for.
-        platforms: What it will run on.
-        name: Of the weights; their card's licence goes along.
+        folder: Output folder for the files `EXPORTED`.
+        dresser: The dresser.
+        fps: Frames per second of the exported function.
+        platforms: Target platforms.
+        name: Name of the weights, whose card and licence are included.
 
     Returns:
-        The files: the function, triangles, a card, and a loader that needs no more than
-        jax, numpy and flatbuffers.
+        The files: the function, triangles, a card, and a loader that needs only jax, numpy
+        and flatbuffers.
 
     Raises:
-        MissingDependencyError: Without flatbuffers, by which jax writes exports.
-        PhysXNetError: A platform that jax doesn't know, or a rate that isn't positive.
+        MissingDependencyError: flatbuffers isn't installed, which jax needs for exports.
+        PhysXNetError: A platform is unknown, or the frame rate isn't positive.
     """
     if not (math.isfinite(fps) and fps > 0):
         raise PhysXNetError(f"fps is {fps}, expected a positive number.")
@@ -107,24 +108,24 @@ def export_dresser(
         "joints": list(dresser.body.joint_names),
         "rotations": "unit quaternions wxyz relative to the parent, [frames, joints, 4]",
         "root": "position of the first joint, metres, Y up, [frames, 3]",
-        "garments": {w.name: int(w.rest.shape[0]) for w in dresser.wearables},
-        "push_out": dresser.push_out,
-        "asked_mirrored": dresser.predictor.mirrored,
-        "relaxation_steps": dresser.predictor.relaxation,
+        "garments": {w.name: int(w.rest.shape[0]) for w in dresser.worn},
+        "collisions": dresser.colliders is not None,
+        "tta": dresser.predictor is not None and dresser.predictor.mirror_tta,
+        "strain_iterations": 0 if dresser.strain is None else dresser.strain.iterations,
         "weights": {k: v for k, v in read_card(name).items() if k != "measured"} if name else {},
         **CARD,
     }
     arrays: dict[str, np.ndarray] = {}
-    for w, faces in zip(dresser.wearables, dresser.faces, strict=True):
+    for w, faces in zip(dresser.worn, dresser.faces, strict=True):
         arrays[f"{w.name}_rest"] = np.asarray(w.rest)
         arrays[f"{w.name}_faces"] = np.asarray(faces)
     folder = pathlib.Path(folder)
-    with whole_file(folder / EXPORTED[0]) as part:
+    with atomic_write(folder / EXPORTED[0]) as part:
         part.write_bytes(blob)
-    with whole_file(folder / EXPORTED[1]) as part, part.open("wb") as file:
+    with atomic_write(folder / EXPORTED[1]) as part, part.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
-    with whole_file(folder / EXPORTED[2]) as part:
+    with atomic_write(folder / EXPORTED[2]) as part:
         part.write_text(json.dumps(card, indent=1) + "\n")
-    with whole_file(folder / EXPORTED[3]) as part:
+    with atomic_write(folder / EXPORTED[3]) as part:
         part.write_text(_LOADER)
     return [folder / f for f in EXPORTED]

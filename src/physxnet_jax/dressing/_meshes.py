@@ -1,4 +1,4 @@
-"""What is written and shown: the body and its garments as animated meshes."""
+"""The body and its garments as animated meshes."""
 
 import dataclasses
 import pathlib
@@ -9,12 +9,15 @@ import numpy as np
 
 from ..body import Body
 from ..errors import PhysXNetError
-from ..garment import TEMPLATES, Garment, template
-from ..io import AnimatedMesh, load_garment
+from ..garment import Garment, load_garment
+from ..io import AnimatedMesh
 from ..motion import Motion, body_animation
 
 Wear = Sequence[Garment | str | pathlib.Path] | Garment | str | pathlib.Path
-"""Garments, garment files or names of templates, or one of them."""
+"""One or several garments, garment files or template names.
+
+Names take options after a colon, see `parse_wear`.
+"""
 
 _COLOURS = ((0.16, 0.27, 0.55), (0.55, 0.28, 0.20), (0.25, 0.45, 0.30), (0.45, 0.25, 0.45))
 _SKIN_COLOUR = (0.69, 0.46, 0.33)
@@ -28,15 +31,15 @@ def animated_meshes(
     positions: Mapping[str, np.ndarray],
     include_body: bool = True,
 ) -> tuple[AnimatedMesh, ...]:
-    """The body (unless left out) and the garments, in the order given.
+    """Makes animated meshes of the body (unless left out) and the garments, in this order.
 
     Args:
         body: The body.
         clip: Its motion.
-        shape: Its shape parameters; the default if None.
-        garments: What is worn.
-        positions: Of each garment by name [m], shape [frames, vertices, 3].
-        include_body: Whether the body comes first.
+        shape: Its shape parameters; the default shape if None.
+        garments: The garments.
+        positions: Positions of each garment by name [m], shape [frames, vertices, 3].
+        include_body: Whether to include the body, as the first mesh.
     """
     meshes = []
     if include_body:
@@ -62,25 +65,23 @@ def animated_meshes(
     return tuple(meshes)
 
 
-def worn_garments(wear: Wear, body: Body) -> tuple[list[Garment], tuple[str, ...]]:
-    """Garments with names that differ, and what to know about the files they come from.
+def resolve_garments(wear: Wear, body: Body) -> tuple[list[Garment], tuple[str, ...]]:
+    """Loads garments, makes their names unique and collects warnings about their files.
 
     Args:
-        wear: Garments, garment files or template names, or one of them.
-        body: What files are modelled on.
+        wear: One or several garments, garment files or template names.
+        body: The body that garment files are modelled on.
 
     Raises:
-        PhysXNetError: A file that can't be read or worn, or nothing to wear.
+        PhysXNetError: A file can't be read or worn, or there is no garment.
     """
     taken = {"body"}
     garments, notes = [], []
-    # One word is a sequence of letters; a path or a garment is none at all.
+    # A string is itself a sequence; a path or a garment isn't one.
     wear = [wear] if isinstance(wear, str | pathlib.Path | Garment) else wear
     for word in wear:
         if isinstance(word, Garment):
             garment = word
-        elif str(word) in TEMPLATES:
-            garment = template(str(word))  # pyright: ignore[reportArgumentType]
         else:
             garment, found = load_garment(word, body=body)
             if found.warning is not None:

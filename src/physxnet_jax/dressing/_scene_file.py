@@ -1,4 +1,4 @@
-"""Scenes from TOML files: motion, garments, effects, accuracy."""
+"""Scenes, from TOML files or arguments: motion, garments, effects, accuracy."""
 
 import dataclasses
 import pathlib
@@ -11,25 +11,15 @@ from jaxtyping import Array, Float
 from ..body import load_body
 from ..errors import FormatError
 from ..files import is_file
-from ..garment import FABRICS, Garment
+from ..garment import FABRICS, parse_wear, with_fabric
 from ..io import split_part
-from ..motion import Motion, sudden_turns
-from ..simulation import (
-    ACCURACY,
-    EFFECTS,
-    Air,
-    Damping,
-    Effect,
-    Scene,
-    SelfContact,
-    standard_effects,
-)
-from ._layers import inside_out
-from ._meshes import Wear, worn_garments
-from ._wanted_clip import wanted_clip
+from ..motion import Motion, prepare_motion, sudden_turns
+from ..simulation import EFFECTS, PRESETS, Effect, Scene
+from ._meshes import Wear, resolve_garments
+from ._simulate import Simulation, build_scene
 
-# Beyond this a whole number is no setting, and no float either.
-_LARGEST = 10**12
+# Larger integers are never valid settings and may not convert to float.
+_MAX_INTEGER = 10**12
 _KEYS: dict[str, type | tuple[type, ...]] = {
     "motion": str,
     "source_fps": (int, float),
@@ -48,13 +38,13 @@ _KEYS: dict[str, type | tuple[type, ...]] = {
 
 @dataclasses.dataclass(frozen=True)
 class SceneFile:
-    """A scene with the motion it is simulated through.
+    """A scene, with the motion of its simulation.
 
     Attributes:
-        scene: Garments, effects, shape.
+        scene: Garments, effects and shape.
         motion: The body's motion.
         accuracy: ``draft``, ``standard`` or ``fine``.
-        notes: What is good to know of the motion, and of garments read from files.
+        notes: Remarks on the motion and on garments read from files.
     """
 
     scene: Scene
@@ -67,44 +57,37 @@ def make_scene(
     motion: str | pathlib.Path | Motion,
     wear: Wear = ("top", "bottom"),
     *,
+    simulation: Simulation | None = None,
+    also: Sequence[Effect] = (),
     fps: float | None = None,
+    start: float = 0.0,
+    frames: int | None = None,
     source_fps: float | None = None,
     skeleton: str | pathlib.Path | None = None,
     joint_map: str | pathlib.Path | None = None,
-    start: float = 0.0,
-    frames: int | None = None,
-    accuracy: str = "standard",
-    fabric: str | None = None,
     shape: Float[Array, " shapes"] | None = None,
-    effects: Sequence[Effect] | None = None,
-    also: Sequence[Effect] = (),
 ) -> SceneFile:
-    """A scene from names and files.
+    """Makes a scene from names and files.
 
     Args:
         motion: A motion, a motion file, or the name of a built-in clip.
-        wear: Garments, garment files or template names; put into the order of layers.
-        fps: Frames a second; a `Motion`'s own if omitted, else 30.
-        source_fps: True rate of a motion file [1/s], where its header is wrong or silent.
-        skeleton: The ASF of an AMC file, if it doesn't lie beside it.
-        joint_map: File of joint names, for a motion file of unknown ones.
-        start: Where in the motion to begin [s].
+        wear: Garments, garment files or template names; sorted into layer order.
+        simulation: Accuracy and effects.
+        also: Additional effects; each replaces an effect of the same type.
+        fps: Frames per second; by default that of a `Motion`, else 30.
+        start: Start time within the motion [s].
         frames: Keep only this many frames.
-        accuracy: ``draft``, ``standard`` or ``fine``.
-        fabric: Name of a fabric for all garments; their own if None.
+        source_fps: True frame rate of a motion file [1/s], if its header lacks it or is wrong.
+        skeleton: The ASF file of an AMC file, if it is in another folder.
+        joint_map: File that maps joint names, for a motion file with unknown ones.
         shape: Shape parameters; the default shape if omitted.
-        effects: What acts; `standard_effects` if None.
-        also: Effects that act besides those; one of the same kind is replaced.
 
     Raises:
-        PhysXNetError: What can't be read or isn't known; the text says what there is.
+        PhysXNetError: A file can't be read or a name is unknown; the message lists the choices.
     """
-    if accuracy not in ACCURACY:
-        raise FormatError(f"No accuracy '{accuracy}'; there are {', '.join(ACCURACY)}.")
-    if fabric is not None and fabric not in FABRICS:
-        raise FormatError(f"No fabric '{fabric}'; there are {', '.join(FABRICS)}.")
+    simulation = Simulation() if simulation is None else simulation
     body = load_body()
-    clip = wanted_clip(
+    clip = prepare_motion(
         motion,
         fps=fps,
         body=body,
@@ -115,32 +98,25 @@ def make_scene(
         skeleton=skeleton,
         joint_map=joint_map,
     )
-    garments, notes = worn_garments(wear, body)
-    if fabric is not None:
-        garments = [made_of(g, fabric) for g in garments]
-    garments = inside_out(garments)
-    acting = standard_effects(len(garments)) if effects is None else tuple(effects)
-    if effects is None and any(isinstance(e, Air) for e in also):
-        # Damping stands for still air: with both it would be there twice.
-        acting = tuple(e for e in acting if not isinstance(e, Damping))
-    scene = Scene(tuple(garments), _merged(acting, also), body, shape)
+    garments, notes = resolve_garments(wear, body)
+    scene = build_scene(garments, body, shape, simulation, also)
     fault = sudden_turns(body, clip)
-    return SceneFile(scene, clip, accuracy, notes if fault is None else (fault, *notes))
+    return SceneFile(scene, clip, simulation.accuracy, notes if fault is None else (fault, *notes))
 
 
 def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneFile:
-    """Reads a scene from TOML; files in it are looked for beside it.
+    """Reads a scene from TOML; paths in it are relative to its folder.
 
     Args:
         path: The file.
-        frames: Keep no more frames than this, however many it asks for.
+        frames: Maximum number of frames, which overrides a larger number in the file.
 
     ::
 
         motion = "walk"            # a built-in clip or a motion file
-        source_fps = 120           # where the file's header is wrong or silent
-        skeleton = "02.asf"        # of an AMC file, if it doesn't lie beside it
-        joint_map = "names.toml"   # only for a file of unknown joint names
+        source_fps = 120           # if the file's header lacks the rate or is wrong
+        skeleton = "02.asf"        # of an AMC file, if it is in another folder
+        joint_map = "names.toml"   # only for a file with unknown joint names
         garments = ["bottom", "top"]
         start = 0.5                # seconds
         frames = 60
@@ -150,21 +126,48 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         file = "top"
         fabric = "silk"
 
-        [also.air]                 # besides what `standard_effects` gives
+        [also.air]                 # in addition to `standard_effects`
         wind = [0.0, 0.0, 4.0]
 
-        [effects.gravity]          # or every effect that acts, and no other
+        [effects.gravity]          # or list all effects, in place of the standard ones
 
     Raises:
-        FormatError: Not TOML, an unknown key, effect or setting.
+        FormatError: The file isn't TOML, or has an unknown key, effect or setting.
     """
     path = pathlib.Path(path)
+    text, words = _read_scene(path)
+    worn, notes = resolve_garments([_resolve_path(path, g["file"]) for g in words], load_body())
+    garments = [
+        with_fabric(w, g["fabric"]) if "fabric" in g else w
+        for w, g in zip(worn, words, strict=True)
+    ]
+    scene_file = make_scene(
+        _resolve_path(path, text["motion"]),
+        garments,
+        fps=float(text.get("fps", 30.0)),
+        source_fps=text.get("source_fps"),
+        skeleton=_resolve_path(path, text["skeleton"]) if "skeleton" in text else None,
+        joint_map=_resolve_path(path, text["joint_map"]) if "joint_map" in text else None,
+        start=float(text.get("start", 0.0)),
+        frames=min((n for n in (frames, text.get("frames")) if n is not None), default=None),
+        simulation=Simulation(
+            accuracy=text.get("accuracy", "standard"),
+            effects=tuple(_parse_effects(path, text["effects"])) if "effects" in text else None,
+        ),
+        shape=load_body().shape(**text["shape"]) if "shape" in text else None,
+        also=_parse_effects(path, text.get("also", {})),
+    )
+    return dataclasses.replace(scene_file, notes=(*scene_file.notes, *notes))
+
+
+def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, str]]]:
+    """The checked keys of a scene file, and its garments as tables."""
     if not is_file(path):
         raise FormatError(f"{path}: no such file. Check the path.")
     try:
         with path.open("rb") as file:
             text = tomllib.load(file)
-    # TOMLDecodeError is one of ValueError; so are numbers that Python refuses.
+    # TOMLDecodeError is a ValueError; Python also raises ValueError for numbers it refuses.
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: not a scene in TOML: {error}.") from None
     unknown = sorted(set(text) - set(_KEYS))
@@ -172,7 +175,7 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         wrong = f"unknown key {unknown[0]}" if unknown else "no key motion"
         raise FormatError(f"{path}: {wrong}; a scene has {', '.join(_KEYS)}.")
     for key, value in text.items():
-        huge = isinstance(value, int) and abs(value) > _LARGEST
+        huge = isinstance(value, int) and abs(value) > _MAX_INTEGER
         if not isinstance(value, _KEYS[key]) or isinstance(value, bool) or huge:
             raise FormatError(f"{path}: {key} can't be {value!r}"[:300] + ".")
     wrong = [k for k, v in text.get("shape", {}).items() if not isinstance(v, int | float)]
@@ -181,60 +184,32 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
     for key in ("fps", "source_fps"):
         if not 0 < float(text.get(key, 30.0)) <= 1e4:
             raise FormatError(f"{path}: {key} is {text[key]}, expected a positive number.")
+    if text.get("accuracy", "standard") not in PRESETS:
+        raise FormatError(f"{path}: accuracy is one of {', '.join(PRESETS)}.")
     words = [
         {"file": g} if isinstance(g, str) else g for g in text.get("garments", ["top", "bottom"])
     ]
     for g in words:
-        told = set(g) if isinstance(g, dict) else {str(g)}
-        if told - {"file", "fabric"} or not all(isinstance(x, str) for x in g.values()):
+        keys = set(g) if isinstance(g, dict) else {str(g)}
+        if keys - {"file", "fabric"} or not all(isinstance(x, str) for x in g.values()):
             raise FormatError(
-                f"{path}: a garment has file and fabric, both names, not {', '.join(told)}."
+                f"{path}: a garment takes the strings file and fabric, not {', '.join(keys)}."
             )
         if "file" not in g:
             raise FormatError(f"{path}: a garment has no file.")
         if "fabric" in g and g["fabric"] not in FABRICS:
             raise FormatError(f"{path}: no fabric '{g['fabric']}'; there are {', '.join(FABRICS)}.")
-    worn, notes = worn_garments([_beside(path, g["file"]) for g in words], load_body())
-    garments = [
-        made_of(w, g["fabric"]) if "fabric" in g else w for w, g in zip(worn, words, strict=True)
-    ]
-    made = make_scene(
-        _beside(path, text["motion"]),
-        garments,
-        fps=float(text.get("fps", 30.0)),
-        source_fps=text.get("source_fps"),
-        skeleton=_beside(path, text["skeleton"]) if "skeleton" in text else None,
-        joint_map=_beside(path, text["joint_map"]) if "joint_map" in text else None,
-        start=float(text.get("start", 0.0)),
-        frames=min((n for n in (frames, text.get("frames")) if n is not None), default=None),
-        accuracy=text.get("accuracy", "standard"),
-        shape=load_body().shape(**text["shape"]) if "shape" in text else None,
-        effects=_effects(path, text["effects"]) if "effects" in text else None,
-        also=_effects(path, text.get("also", {})),
-    )
-    return dataclasses.replace(made, notes=(*made.notes, *notes))
+    return text, words
 
 
-def made_of(garment: Garment, fabric: str) -> Garment:
-    """A garment of another fabric, by name.
-
-    It keeps at least the distance from the skin that it was made for: that one depends on
-    how coarse its mesh is and on what it lies over, not on the cloth alone.
-    """
-    cloth = FABRICS[fabric]
-    thickness = max(cloth.thickness, garment.fabric.thickness)
-    return dataclasses.replace(garment, fabric=dataclasses.replace(cloth, thickness=thickness))
-
-
-def _beside(path: pathlib.Path, word: str) -> str | pathlib.Path:
+def _resolve_path(path: pathlib.Path, word: str) -> str | pathlib.Path:
     there = path.parent / word
-    # A garment may have "#mesh" and "=top" behind it.
-    plain = path.parent / (word.rpartition("=")[0] or word)
-    files = (there, plain, split_part(there)[0], split_part(plain)[0])
-    return there if any(map(is_file, files)) else word
+    # A garment's path may be followed by "#mesh" and options.
+    files = (path.parent / name for name in (word, parse_wear(word).name))
+    return there if any(is_file(split_part(f)[0]) or is_file(f) for f in files) else word
 
 
-def _effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:
+def _parse_effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:
     out = []
     for name, settings in table.items():
         if name not in EFFECTS:
@@ -242,7 +217,7 @@ def _effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:
         kind = EFFECTS[name]
         if not isinstance(settings, dict):
             raise FormatError(
-                f"{path}: {name} is a table of settings, not {settings!r}"[:300] + "."
+                f"{path}: {name} must be a table of settings, not {settings!r}"[:300] + "."
             )
         fields = {f.name: f for f in dataclasses.fields(kind)}
         unknown = sorted(set(settings) - set(fields))
@@ -250,17 +225,17 @@ def _effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:
             there = ", ".join(fields) or "no settings"
             raise FormatError(f"{path}: {name} has no '{unknown[0]}'; it has {there}.")
         try:
-            out.append(kind(**{k: _value(fields[k], v) for k, v in settings.items()}))
+            out.append(kind(**{k: _convert_setting(fields[k], v) for k, v in settings.items()}))
         except (TypeError, ValueError, OverflowError) as error:
             raise FormatError(f"{path}: {name}: {error}"[:300] + ".") from None
     return out
 
 
-def _value(field: dataclasses.Field, value: Any) -> Any:
+def _convert_setting(field: dataclasses.Field, value: Any) -> Any:
     if isinstance(value, list):
         if any(isinstance(v, list) for v in value):
             raise TypeError(f"{field.name} is a list of lists")
-        return tuple(_value(field, v) for v in value)
+        return tuple(_convert_setting(field, v) for v in value)
     wants_float = field.type is float or "float" in str(field.type)
     if wants_float and (isinstance(value, bool) or not isinstance(value, int | float)):
         raise TypeError(f"{field.name} is {value!r}, expected a number")
@@ -269,12 +244,3 @@ def _value(field: dataclasses.Field, value: Any) -> Any:
     if field.type is bool and not isinstance(value, bool):
         raise TypeError(f"{field.name} is {value!r}, expected true or false")
     return float(value) if isinstance(value, int) and wants_float else value
-
-
-def _merged(effects: Sequence[Effect], also: Sequence[Effect]) -> tuple[Effect, ...]:
-    """Both together, in the order of `EFFECTS`; effects of one's own before all contact."""
-    rank = {kind: k for k, kind in enumerate(EFFECTS.values())}
-    own = rank[SelfContact] - 0.5
-    new = {type(e) for e in also}
-    kept = [e for e in effects if type(e) not in new]
-    return tuple(sorted((*kept, *also), key=lambda e: rank.get(type(e), own)))

@@ -1,4 +1,4 @@
-"""Where the time goes."""
+"""Timing of stages."""
 
 import dataclasses
 import time
@@ -9,9 +9,10 @@ class Stage:
     """Time of one stage.
 
     Attributes:
-        name: What was done.
-        cold_ms: First time, compilation included [ms]; in all if not by frame.
-        warm_ms: Median of the later times [ms a frame]; None if it ran once.
+        name: Name of the stage.
+        cold_ms: Time of the first run, compilation included [ms]; the total time of a
+            stage that doesn't run by frames.
+        warm_ms: Median time of later runs [ms per frame]; None if it ran once.
     """
 
     name: str
@@ -20,7 +21,7 @@ class Stage:
 
 
 class Watch:
-    """Notes how long each stage takes."""
+    """Records how long each stage takes."""
 
     def __init__(self, stages: list[Stage]) -> None:
         self._stages = stages

@@ -1,4 +1,4 @@
-"""Metrics and reports: what an answer is worth, and what holds where it is hard."""
+"""Accuracy metrics, robustness reports and cost tables of dressing methods."""
 
 from ._baselines import (
     nearest_frame as nearest_frame,
@@ -8,12 +8,29 @@ from ._baselines import (
 )
 from ._bench import (
     JITTER as JITTER,
-    BenchScene as BenchScene,
     Work as Work,
     bench_scenes as bench_scenes,
     bench_simulation as bench_simulation,
     solvers as solvers,
     time_to_error as time_to_error,
+)
+from ._cost import (
+    Cost as Cost,
+    mean_errors as mean_errors,
+    network_costs as network_costs,
+    network_errors as network_errors,
+    other_costs as other_costs,
+    present_devices as present_devices,
+)
+from ._cost_table import (
+    ALONE_AND_TOGETHER as ALONE_AND_TOGETHER,
+    MethodProfile as MethodProfile,
+    Selection as Selection,
+    calibrate as calibrate,
+    calibration_file as calibration_file,
+    load_cost_table as load_cost_table,
+    select_method as select_method,
+    worn_key as worn_key,
 )
 from ._dataset_check import check_sequence as check_sequence
 from ._evaluate import (
@@ -23,19 +40,19 @@ from ._evaluate import (
     means as means,
     retime as retime,
 )
+from ._method_names import (
+    MIRROR as MIRROR,
+    method_by_name as method_by_name,
+    method_name as method_name,
+    parse_method as parse_method,
+)
 from ._methods import (
-    ENGINES as ENGINES,
-    NOISE as NOISE,
-    Answer as Answer,
-    Blockwise as Blockwise,
     Method as Method,
-    Simulator as Simulator,
-    engine as engine,
+    Prediction as Prediction,
     network as network,
-    rest_and_skin as rest_and_skin,
     skinning as skinning,
 )
-from ._metrics import VertexError as VertexError, vertex_error as vertex_error
+from ._metrics import vertex_error as vertex_error
 from ._motion_metrics import (
     acceleration_error as acceleration_error,
     area_strain as area_strain,
@@ -44,21 +61,14 @@ from ._motion_metrics import (
     jitter as jitter,
     wrinkle_error as wrinkle_error,
 )
-from ._penetration import Penetration as Penetration, penetration as penetration
-from ._price import (
-    Advice as Advice,
-    Price as Price,
-    price_effects as price_effects,
-    recommend_effects as recommend_effects,
-)
+from ._penetration import penetration as penetration
+from ._price import price_effects as price_effects, recommend_effects as recommend_effects
 from ._strain import edge_strain as edge_strain
 from ._stress import CASES as CASES, Finding as Finding, run_case as run_case
 from ._stress_worn import PEER_CASES as PEER_CASES, run_peer as run_peer
 from ._tables import error_tables as error_tables, summary_table as summary_table
 from ._textile import (
     DRAPE_BANDS as DRAPE_BANDS,
-    Cantilever as Cantilever,
-    Drape as Drape,
     cantilever_test as cantilever_test,
     drape_test as drape_test,
 )

@@ -1,4 +1,4 @@
-"""Baselines that learn from the training set: the nearest frame, and a net of the pose."""
+"""Learned baselines: the nearest training frame, and a perceptron of the pose."""
 
 import dataclasses
 import functools
@@ -12,10 +12,8 @@ import optax
 from jaxtyping import Array, Float
 
 from ..body import Body, load_body
-from ..data import QUANTUM, Sequence
+from ..data import QUANTIZATION_STEP, Frames, Sequence, load_frames
 from ..garment import Template, template
-from ..models import Inputs
-from ..training import Frames, load_frames
 from ._methods import Blockwise, place_local, rest_and_skin
 
 _HIDDEN = 512
@@ -25,49 +23,49 @@ _BATCH = 64
 def pose_features(
     rotations: Float[Array, "frames joints 3 3"], parents: tuple[int, ...]
 ) -> Float[Array, "frames features"]:
-    """What a pose is, wherever the person stands and whichever way they face.
+    """Pose features that are invariant to the person's position and heading.
 
-    Rotations of joints relative to their parents, and the direction of gravity in the
-    frame of the first joint.
+    They are the joint rotations relative to the parents, and the direction of gravity in
+    the frame of the first joint.
 
     Args:
         rotations: World rotations.
         parents: Parent of each joint, -1 for the first.
     """
-    up = jnp.asarray([max(p, 0) for p in parents], dtype=jnp.int32)
-    relative = jnp.einsum("fjba,fjbc->fjac", rotations[:, up], rotations)
+    parent_index = jnp.asarray([max(p, 0) for p in parents], dtype=jnp.int32)
+    relative = jnp.einsum("fjba,fjbc->fjac", rotations[:, parent_index], rotations)
     inner = jnp.asarray([j for j, p in enumerate(parents) if p >= 0], dtype=jnp.int32)
     joints = relative[:, inner].reshape(len(rotations), -1)
     return jnp.concatenate([joints, -rotations[:, 0, 1, :]], axis=1)
 
 
 @dataclasses.dataclass(frozen=True)
-class _Known:
-    """A template's cloth in the training set, in each vertex's own frame."""
+class _PoseData:
+    """Pose features and vertex-local cloth offsets of a template in the training set."""
 
     features: np.ndarray
     offsets: np.ndarray
 
 
-def _known(frames: Frames, body: Body, name: Template) -> _Known:
+def _pose_data(frames: Frames, body: Body, name: Template) -> _PoseData:
     use = frames.usable[name]
     rotations = jnp.asarray(frames.rotations[use, -1])
-    return _Known(np.asarray(pose_features(rotations, body.parents)), frames.targets[name][use])
+    return _PoseData(np.asarray(pose_features(rotations, body.parents)), frames.targets[name][use])
 
 
 def training_frames(sequences: Items[Sequence], names: Items[Template]) -> Frames:
-    """Training frames with targets in each vertex's own frame."""
+    """Loads training frames with targets in vertex-local frames."""
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
-    return load_frames(sequences, {t: template(t) for t in names}, body, rest, Inputs("local", 1))
+    return load_frames(sequences, {t: template(t) for t in names}, body, rest, window=1, local=True)
 
 
 def nearest_frame(frames: Frames) -> Blockwise:
-    """The cloth of the training frame whose pose is nearest."""
+    """A method that returns the cloth of the training frame with the nearest pose."""
     body = load_body()
 
     def wear(name: Template) -> Any:
-        known = _known(frames, body, name)
+        known = _pose_data(frames, body, name)
         return (
             rest_and_skin(name),
             jnp.asarray(known.features),
@@ -80,9 +78,9 @@ def nearest_frame(frames: Frames) -> Blockwise:
 @functools.partial(jax.jit, static_argnames=("fps",))
 def _nearest(worn: Any, r: Array, t: Array, fps: float) -> Array:
     rest, features, offsets = worn
-    mine = pose_features(r, load_body().parents)
-    gap = jnp.sum((mine[:, None] - features[None]) ** 2, axis=2)
-    found = offsets[jnp.argmin(gap, axis=1)].astype(jnp.float32) * QUANTUM
+    query = pose_features(r, load_body().parents)
+    distance = jnp.sum((query[:, None] - features[None]) ** 2, axis=2)
+    found = offsets[jnp.argmin(distance, axis=1)].astype(jnp.float32) * QUANTIZATION_STEP
     return place_local(rest, r, t, found)
 
 
@@ -96,22 +94,22 @@ def pose_network(
     """A perceptron from the pose alone to every vertex's offset, one for each garment.
 
     Args:
-        frames: What it learns from.
-        steps: Of Adam.
-        seed: Of its parameters and batches.
-        report: Called with a text, steps done and steps in all.
+        frames: Training frames.
+        steps: Number of Adam steps.
+        seed: Seed of the initial parameters and the batches.
+        report: Called with a text, the steps done and the total.
 
     References:
-        Patel, Liao and Pons-Moll, TailorNet (2020), section 5: its own baseline.
+        Patel, Liao and Pons-Moll, TailorNet (2020), section 5: its baseline.
     """
     body = load_body()
 
     def wear(name: Template) -> Any:
-        known = _known(frames, body, name)
+        known = _pose_data(frames, body, name)
         params, scale = _fit(known, steps, seed, name, report)
         return rest_and_skin(name), params, scale
 
-    return Blockwise(_ask, functools.cache(wear))
+    return Blockwise(_predict, functools.cache(wear))
 
 
 def _perceptron(params: list[tuple[Array, Array]], x: Array) -> Array:
@@ -122,7 +120,7 @@ def _perceptron(params: list[tuple[Array, Array]], x: Array) -> Array:
 
 
 @functools.partial(jax.jit, static_argnames=("fps",))
-def _ask(worn: Any, r: Array, t: Array, fps: float) -> Array:
+def _predict(worn: Any, r: Array, t: Array, fps: float) -> Array:
     rest, params, (mean, deviation) = worn
     x = (pose_features(r, load_body().parents) - mean[None]) / deviation[None]
     out = _perceptron(params, x).reshape(len(r), -1, 3)
@@ -130,14 +128,14 @@ def _ask(worn: Any, r: Array, t: Array, fps: float) -> Array:
 
 
 def _fit(
-    known: _Known,
+    known: _PoseData,
     steps: int,
     seed: int,
     name: str,
     report: Callable[[str, int, int], None] | None,
 ) -> tuple[Any, tuple[Array, Array]]:
     mean = known.features.mean(axis=0)
-    # A joint that hardly turned in training says nothing when it does.
+    # The floor keeps joints that hardly rotated in training from dominating when they do.
     deviation = np.maximum(known.features.std(axis=0), 0.05)
     features = jnp.asarray((known.features - mean) / deviation)
     offsets = jnp.asarray(known.offsets)
@@ -152,11 +150,11 @@ def _fit(
 
     @jax.jit
     def step(params: Any, state: Any, key: Array) -> tuple[Any, Any]:
-        pick = jax.random.randint(key, (_BATCH,), 0, len(features))
+        batch = jax.random.randint(key, (_BATCH,), 0, len(features))
 
         def loss(p: Any) -> Array:
-            want = offsets[pick].astype(jnp.float32).reshape(_BATCH, -1) * QUANTUM
-            return jnp.mean(jnp.abs(_perceptron(p, features[pick]) - want))
+            target = offsets[batch].astype(jnp.float32).reshape(_BATCH, -1) * QUANTIZATION_STEP
+            return jnp.mean(jnp.abs(_perceptron(p, features[batch]) - target))
 
         grads = jax.grad(loss)(params)
         with jax.numpy_dtype_promotion("standard"):

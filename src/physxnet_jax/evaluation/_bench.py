@@ -1,4 +1,4 @@
-"""Work against precision: what each solver's accuracy costs, on three scenes."""
+"""Work-precision benchmark of the solvers on three scenes."""
 
 import dataclasses
 import functools
@@ -15,23 +15,18 @@ from ..motion import Motion, load_motion
 from ..simulation import (
     ROLLOUT_BLOCK,
     XPBD,
-    Bend,
-    BodyContact,
-    Damping,
-    Gravity,
     Implicit,
-    Pin,
     PreparedScene,
     Rollout,
     Scene,
     Solver,
-    Stretch,
     Verlet,
     prepare_scene,
+    settle_on_static_body,
     simulate_batch,
-    simulate_still,
 )
 from ..simulation.blender import BlenderSettings, simulate_blender
+from ..simulation.effects import Bend, BodyContact, Damping, Gravity, Pin, Stretch
 from ..simulation.newton import NewtonSettings, simulate_newton
 from ._penetration import penetration
 from ._strain import edge_strain
@@ -39,7 +34,7 @@ from ._strain import edge_strain
 _FPS = 30.0
 _REPEATS = 3
 JITTER = "jitter 1e-6 m"
-"""Setting of the row that is the noise floor."""
+"""Setting of the row of the noise floor."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,20 +43,20 @@ class Work:
 
     Attributes:
         scene: ``sheet``, ``skirt`` or ``shirt``.
-        solver: Its name.
-        setting: Substeps a frame, or what else was varied.
-        rms_mm: Distance to the reference over vertices and frames [mm].
-        max_mm: Its maximum [mm].
-        penetration_share: Share of cloth vertices inside the body where there is room
-            above their skin, all frames (see `Penetration`).
-        pinched_share: Share of those inside where the body leaves no room.
-        penetrating_frames: Frames with any of the former.
+        solver: Name of the solver.
+        setting: Substeps per frame, or another varied setting.
+        rms_mm: RMS distance to the reference over vertices and frames [mm].
+        max_mm: Maximum of that distance [mm].
+        penetration_share: Share of cloth vertices inside the body, pinched ones excluded,
+            over all frames (see `Penetration`).
+        pinched_share: Share of cloth vertices that are pinched.
+        penetrating_frames: Number of frames with vertices inside that aren't pinched.
         skin_outside_share: Share of skin that sticks out of the cloth over it.
         strain_p99: 99th percentile of the strain of edges.
         ms_per_frame: Median time of warm runs [ms].
-        cold_s: What the first run took longer: compilation, mostly [s].
-        reference: What the error is measured against.
-        failed: Why there are no numbers; empty if there are.
+        cold_s: Extra time of the first run, mostly compilation [s].
+        reference: Name of the reference.
+        failed: Why the run failed; empty if it succeeded.
     """
 
     scene: str
@@ -82,15 +77,15 @@ class Work:
 
 @dataclasses.dataclass(frozen=True)
 class BenchScene:
-    """What is simulated.
+    """A scene of the benchmark.
 
     Attributes:
         name: Its name in the table.
         scene: Garments and effects.
-        motion: The body's motion; None if it stands still.
-        frames: Frames that are compared.
-        reference: The solver that counts as the truth.
-        check: A finer or coarser one, to tell how far the truth can be trusted.
+        motion: The body's motion; None if it is static.
+        frames: Number of compared frames.
+        reference: Solver of the reference.
+        check: A finer or coarser solver, which shows how accurate the reference is.
     """
 
     name: str
@@ -111,8 +106,8 @@ def bench_scenes(
 
     Args:
         shirt: The shirt; the template ``top`` if None.
-        action: What the person in it does; the built-in punch if None.
-        frames: Frames of the two worn scenes.
+        action: Motion of the shirt's wearer; the built-in punch if None.
+        frames: Number of frames of the skirt and the shirt.
     """
     soft = Fabric(stretch=300.0, bend=2e-5)
     sheet = square_sheet(17, 0.6, pinned=np.arange(17), fabric=soft)
@@ -138,7 +133,7 @@ def bench_scenes(
 
 
 def solvers(worn: bool) -> list[tuple[str, str, Solver]]:
-    """Name, setting and solver of every row that is ours."""
+    """Name, setting and solver of every row of the package's solvers."""
     rows: list[tuple[str, str, Solver]] = []
     for n in (8, 16, 32, 64, 128):
         rows.append(("xpbd", f"{n}", XPBD(n, max(1, n // 8) if worn else 1)))
@@ -159,22 +154,22 @@ def bench_simulation(
 ) -> Iterator[Work]:
     """Measures every solver on every scene, row by row.
 
-    The rows of a scene: a cloth that only hangs where skinning puts it (it must be the
-    worst), our solvers, the reference against its check, the noise floor (the default
-    with its garment moved by 1e-6 m), and Blender and Newton against their own
-    finest settings.
+    The rows of a scene are: cloth that keeps its rest positions (it must be the worst), the
+    package's solvers, the check against the reference, the noise floor (the default solver
+    with the garment perturbed by 1e-6 m), and Blender and Newton, each against its finest
+    setting.
 
     Args:
         scenes: See `bench_scenes`.
-        methods: Name, setting and solver of our rows; `solvers` if None.
+        methods: Name, setting and solver of the package's rows; `solvers` if None.
         blender: Qualities of Blender to run, the finest last; none if empty.
         newton: Substeps of Newton to run, likewise.
-        done: Rows that were measured before; they aren't again.
-        progress: Called with what is being measured.
+        done: Rows measured before, which are skipped.
+        progress: Called with a description of each measurement.
     """
-    have = {(r.scene, r.solver, r.setting) for r in done}
+    measured = {(r.scene, r.solver, r.setting) for r in done}
 
-    def tell(text: str) -> None:
+    def report(text: str) -> None:
         if progress is not None:
             progress(text)
 
@@ -182,26 +177,26 @@ def bench_simulation(
         prepared = prepare_scene(b.scene)
         worn = b.motion is not None
         every = solvers(worn) if methods is None else methods
-        ours = [s for s in every if (b.name, s[0], s[1]) not in have]
+        own_rows = [s for s in every if (b.name, s[0], s[1]) not in measured]
         extras = [("nothing", ""), ("verlet float64", "check"), ("xpbd", JITTER)]
-        extras = [e for e in extras if (b.name, *e) not in have]
-        named = "verlet float64"
-        if ours or extras:
-            tell(f"{b.name}: reference")
+        extras = [e for e in extras if (b.name, *e) not in measured]
+        ref = "verlet float64"
+        if own_rows or extras:
+            report(f"{b.name}: reference")
             truth, _, _ = _timed(b, prepared, b.reference, repeats=1)
         if ("nothing", "") in extras:
-            yield _row(b, prepared, "nothing", "", _still(b, prepared), truth, 0.0, 0.0, named)
-        for name, setting, solver in ours:
-            tell(f"{b.name}: {name}, {setting}")
-            yield _attempt(b, prepared, name, setting, solver, truth, named)
+            yield _row(b, prepared, "nothing", "", _at_rest(b, prepared), truth, 0.0, 0.0, ref)
+        for name, setting, solver in own_rows:
+            report(f"{b.name}: {name}, {setting}")
+            yield _attempt(b, prepared, name, setting, solver, truth, ref)
             jax.clear_caches()
         if ("verlet float64", "check") in extras:
-            tell(f"{b.name}: check of the reference")
+            report(f"{b.name}: check of the reference")
             x, ms, cold = _timed(b, prepared, b.check, repeats=1)
-            yield _row(b, prepared, "verlet float64", "check", x, truth, ms, cold, named)
+            yield _row(b, prepared, "verlet float64", "check", x, truth, ms, cold, ref)
             jax.clear_caches()
         if ("xpbd", JITTER) in extras:
-            tell(f"{b.name}: noise floor")
+            report(f"{b.name}: noise floor")
             base, ms, cold = _timed(b, prepared, XPBD(32, 4 if worn else 1), repeats=1)
             moved = prepare_scene(dataclasses.replace(b.scene, garments=_jittered(b.scene)))
             x, ms, _ = _timed(b, moved, XPBD(32, 4 if worn else 1), repeats=1)
@@ -223,7 +218,7 @@ def bench_simulation(
                 },
             }
             for name, runs in peers.items():
-                yield from _peer(b, prepared, name, runs, have, tell)
+                yield from _peer(b, prepared, name, runs, measured, report)
 
 
 def _attempt(
@@ -233,24 +228,24 @@ def _attempt(
     setting: str,
     solver: Solver,
     truth: Float[np.ndarray, "frames vertices 3"],
-    named: str,
+    ref: str,
 ) -> Work:
     try:
         x, ms, cold = _timed(b, prepared, solver)
-        return _row(b, prepared, name, setting, x, truth, ms, cold, named)
+        return _row(b, prepared, name, setting, x, truth, ms, cold, ref)
     except PhysXNetError as error:
-        return _failure(b.name, name, setting, str(error), named)
+        return _failure(b.name, name, setting, str(error), ref)
 
 
-def _failure(scene: str, name: str, setting: str, why: str, named: str) -> Work:
+def _failure(scene: str, name: str, setting: str, why: str, ref: str) -> Work:
     nan = float("nan")
-    return Work(scene, name, setting, nan, nan, nan, nan, 0, nan, nan, nan, nan, named, why)
+    return Work(scene, name, setting, nan, nan, nan, nan, 0, nan, nan, nan, nan, ref, why)
 
 
 def _run(b: BenchScene, prepared: PreparedScene, solver: Solver) -> tuple[Rollout, list[float]]:
     ticks = [time.perf_counter()]
     if b.motion is None:
-        out = simulate_still(prepared, b.frames, solver=solver, fps=_FPS)
+        out = settle_on_static_body(prepared, b.frames, solver=solver, fps=_FPS)
         ticks.append(time.perf_counter())
         return out, [(ticks[1] - ticks[0]) / b.frames]
     out = simulate_batch(
@@ -262,7 +257,7 @@ def _run(b: BenchScene, prepared: PreparedScene, solver: Solver) -> tuple[Rollou
 def _timed(
     b: BenchScene, prepared: PreparedScene, solver: Solver, repeats: int = _REPEATS
 ) -> tuple[Float[np.ndarray, "frames vertices 3"], float, float]:
-    """Positions, milliseconds a frame when warm, and what the first run took longer [s]."""
+    """Positions, warm time per frame [ms], and extra time of the first run [s]."""
     began = time.perf_counter()
     out, laps = _run(b, prepared, solver)
     first = time.perf_counter() - began
@@ -286,7 +281,7 @@ def _row(
     truth: Float[np.ndarray, "frames vertices 3"],
     ms: float,
     cold: float,
-    named: str,
+    ref: str,
 ) -> Work:
     gap = np.linalg.norm(np.asarray(x, np.float64) - truth, axis=2)
     inside, pinched, frames, skin = 0.0, 0.0, 0, 0.0
@@ -309,12 +304,12 @@ def _row(
         float(np.quantile(edge_strain(prepared.assembly, x), 0.99)),
         ms,
         cold,
-        named,
+        ref,
     )
 
 
-def _still(b: BenchScene, prepared: PreparedScene) -> Float[np.ndarray, "frames vertices 3"]:
-    """What doing nothing gives: cloth that keeps its rest shape, somewhere."""
+def _at_rest(b: BenchScene, prepared: PreparedScene) -> Float[np.ndarray, "frames vertices 3"]:
+    """The trivial baseline: cloth that keeps its rest positions."""
     rest = prepared.assembly.rest.astype(np.float32)
     return np.repeat(rest[None], b.frames, axis=0)
 
@@ -335,37 +330,37 @@ def _peer(
     prepared: PreparedScene,
     name: str,
     runs: Mapping[str, Callable[[Motion], Rollout]],
-    have: set[tuple[str, str, str]],
-    tell: Callable[[str], None],
+    measured: set[tuple[str, str, str]],
+    report: Callable[[str], None],
 ) -> Iterator[Work]:
-    """Another simulator at several settings, each against the last one."""
-    if all((b.name, name, setting) in have for setting in runs):
+    """An external simulator at several settings, each against the last one."""
+    if all((b.name, name, setting) in measured for setting in runs):
         return
-    named = f"{name}, {list(runs)[-1]}"
+    ref = f"{name}, {list(runs)[-1]}"
     results: dict[str, Rollout] = {}
     assert b.motion is not None
     for setting, run in runs.items():
-        tell(f"{b.name}: {name}, {setting}")
+        report(f"{b.name}: {name}, {setting}")
         try:
             results[setting] = run(b.motion)
         except MissingDependencyError:
             raise
         except PhysXNetError as error:
-            yield _failure(b.name, name, setting, str(error), named)
-    if named.removeprefix(f"{name}, ") not in results:
+            yield _failure(b.name, name, setting, str(error), ref)
+    if ref.removeprefix(f"{name}, ") not in results:
         return
     truth = results[list(runs)[-1]].positions[0]
     for setting, out in results.items():
         ms = float(np.median(out.diagnostics["milliseconds"][1:]))
-        yield _row(b, prepared, name, setting, out.positions[0], truth, ms, 0.0, named)
+        yield _row(b, prepared, name, setting, out.positions[0], truth, ms, 0.0, ref)
 
 
 def time_to_error(rows: Sequence[Work], limit_mm: float) -> Work | None:
-    """The cheapest row of ours within an error (rms), if any.
+    """The fastest row of the package's solvers within an RMS error, if any.
 
     Args:
-        rows: Of one scene.
-        limit_mm: The error [mm].
+        rows: Rows of one scene.
+        limit_mm: Largest RMS error [mm].
     """
     good = [
         r

@@ -1,4 +1,4 @@
-"""What is wrong with a dataset's action, if anything."""
+"""Quality checks of a dataset's actions."""
 
 from typing import SupportsFloat
 
@@ -13,29 +13,29 @@ from ._penetration import penetration
 from ._strain import edge_strain
 from ._stress import Finding
 
-# Cloth farther from its skinning than this has come off or exploded [m].
-_FAR = 0.6
-# Share of vertices inside the body that have room outside [1].
-_INSIDE = 0.02
+# A larger offset from skinning means that the cloth came off or exploded [m].
+_MAX_OFFSET = 0.6
+# Share of vertices inside the body, pinched ones excluded [1].
+_MAX_INSIDE = 0.02
 # 99th percentile of strain [1].
-_STRAIN = 0.4
-# Jerk of the cloth over that of its skinning [1].
-_JITTER = 10.0
-# Jerk of a person who stands still, or less [m/s^3]: cloth on one needn't be stiller.
-_STILL = 1.0
-_EVERY = 10
+_MAX_STRAIN = 0.4
+# Jerk of the cloth relative to its skinning [1].
+_MAX_JERK_RATIO = 10.0
+# Floor for the skinning's jerk in that ratio: a person standing still has no more [m/s^3].
+_MIN_JERK = 1.0
+_FRAME_STRIDE = 10
 
 
 def check_sequence(sequence: Sequence, frames: int | None = None) -> list[Finding]:
-    """Findings of one action, those within their bounds included.
+    """Returns the findings of one action, including those within their bounds.
 
     Args:
         sequence: The action with its garments.
-        frames: How many frames it should have, if known.
+        frames: Expected number of frames, if known.
     """
     out: list[Finding] = []
 
-    def find(name: str, quantity: str, bound: float, measured: SupportsFloat) -> None:
+    def add(name: str, quantity: str, bound: float, measured: SupportsFloat) -> None:
         out.append(Finding(f"{sequence.name}, {name}", quantity, bound, float(measured)))
 
     names: list[Template] = [t for t in TEMPLATES if t in sequence.offsets]
@@ -43,23 +43,23 @@ def check_sequence(sequence: Sequence, frames: int | None = None) -> list[Findin
         offsets = sequence.offsets[name]
         motion = sequence.motion
         if frames is not None:
-            find(name, "frames missing", 0.0, abs(len(offsets) - frames))
-        find(name, "not finite", 0.0, 0.0 if sequence.meta[name]["finite"] else 1.0)
-        find(name, "vertices missing", 0.0, abs(offsets.shape[1] - template(name).num_vertices))
-        find(name, "largest offset, m", _FAR, np.linalg.norm(offsets, axis=2).max())
+            add(name, "frames missing", 0.0, abs(len(offsets) - frames))
+        add(name, "not finite", 0.0, 0.0 if sequence.meta[name]["finite"] else 1.0)
+        add(name, "vertices missing", 0.0, abs(offsets.shape[1] - template(name).num_vertices))
+        add(name, "largest offset, m", _MAX_OFFSET, np.linalg.norm(offsets, axis=2).max())
         if offsets.shape[1] != template(name).num_vertices:
             continue
-        find(name, "frames unlike the motion's", 0.0, abs(len(offsets) - motion.num_frames))
+        add(name, "frame count difference to motion", 0.0, abs(len(offsets) - motion.num_frames))
         if len(offsets) != motion.num_frames:
             continue
         scene = prepare_scene(Scene((template(name),)))
         skinned = skinning()(motion, name).positions
         cloth = skinned + offsets
-        looked = np.arange(0, len(cloth), _EVERY)
-        seen = penetration(scene.assembly, motion, cloth, frames=looked, bare_skin=False)
-        find(name, "inside the body, share", _INSIDE, (seen.cloth_inside & ~seen.pinched).mean())
+        sampled = np.arange(0, len(cloth), _FRAME_STRIDE)
+        seen = penetration(scene.assembly, motion, cloth, frames=sampled, bare_skin=False)
+        add(name, "inside the body, share", _MAX_INSIDE, (seen.cloth_inside & ~seen.pinched).mean())
         strain = np.abs(edge_strain(scene.assembly, cloth))
-        find(name, "strain, 99 %", _STRAIN, np.quantile(strain, 0.99))
-        still = max(jitter(skinned, motion.fps), _STILL)
-        find(name, "jerk over that of skinning", _JITTER, jitter(cloth, motion.fps) / still)
+        add(name, "strain, 99 %", _MAX_STRAIN, np.quantile(strain, 0.99))
+        still = max(jitter(skinned, motion.fps), _MIN_JERK)
+        add(name, "jerk relative to skinning", _MAX_JERK_RATIO, jitter(cloth, motion.fps) / still)
     return out

@@ -1,4 +1,4 @@
-"""The error of every action and template: the paper's two figures, and what they miss."""
+"""Errors of every action and template: the paper's two figures and further metrics."""
 
 import dataclasses
 import math
@@ -8,12 +8,11 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._environment import free_programs
+from .._environment import clear_caches_if_full
 from ..body import load_body
-from ..data import Sequence
+from ..data import Sequence, usable_garment
 from ..garment import Template, template
 from ..simulation import Assembly, Scene, prepare_scene
-from ..training import usable_garment
 from ..uv import Transference, garment_map_rows, make_atlas
 from ._methods import Method, skinning
 from ._metrics import vertex_error
@@ -28,12 +27,12 @@ from ._motion_metrics import (
 from ._penetration import penetration
 from ._strain import edge_strain
 
-# Maps on which errors at texels are taken, whatever a network's own size.
+# Resolution of the maps for texel errors, whatever the network's resolution.
 _RESOLUTION = 128
-# Penetration is looked for in every fifth frame: it takes longer than all else.
-_EVERY = 5
+# Penetration is measured in every fifth frame: it takes longer than all other metrics.
+_PENETRATION_STRIDE = 5
 DIGITS = 16
-"""Of checksums that are noted in rows."""
+"""Number of digits of the checksums in rows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,8 +40,8 @@ class ActionError:
     """One method on one action and template.
 
     Attributes:
-        engine: What made the reference.
-        method: What is measured.
+        engine: Simulator of the reference.
+        method: Name of the method.
         action: Name of the action.
         template: Name of the garment.
         frames: Number of frames.
@@ -53,23 +52,23 @@ class ActionError:
         mean_mm: Mean distance [mm].
         p95_mm: 95th percentile of distances [mm].
         max_mm: Largest distance [mm].
-        penetration_share: Share of vertices inside the body that have room outside
-            (every fifth frame).
-        pinched_share: Share inside that have none, see `penetration`.
-        penetration_mm: Deepest of the former [mm].
+        penetration_share: Share of vertices inside the body, pinched ones excluded (every
+            fifth frame).
+        pinched_share: Share of pinched vertices, see `penetration`.
+        penetration_mm: Greatest depth of vertices inside that aren't pinched [mm].
         strain_p99: 99th percentile of the absolute strain of edges [1].
-        area_strain_p99: Likewise of triangles' areas [1].
+        area_strain_p99: 99th percentile of the absolute strain of triangles' areas [1].
         wrinkle_deg: See `wrinkle_error` [degrees].
-        acceleration_error: See there [m/s^2].
+        acceleration_error: See the function of that name [m/s^2].
         jitter: Mean jerk [m/s^3].
-        jitter_reference: That of the reference.
-        finite_share: Share of frames that are finite; errors are over these.
-        ms_per_frame: From joint rotations to this template's vertices, warm.
-        fold_strength: Over that of the reference, see there [1].
-        strain_p99_reference: ``strain_p99`` of the reference.
-        data: Checksum of the reference's offsets; empty where it wasn't noted.
-        weights: That of the network's weights, likewise; of the dataset that `nearest` and
-            `mlp` learned from.
+        jitter_reference: ``jitter`` of the reference [m/s^3].
+        finite_share: Share of finite frames; errors are computed over these.
+        ms_per_frame: Warm time from joint rotations to this template's vertices [ms].
+        fold_strength: Relative to the reference, see the function of that name [1].
+        strain_p99_reference: ``strain_p99`` of the reference [1].
+        data: Checksum of the reference's offsets; empty if it wasn't recorded.
+        weights: Checksum of the network's weights, or of the training data of `nearest` and
+            `mlp`; empty if it wasn't recorded.
     """
 
     engine: str
@@ -112,15 +111,15 @@ def evaluate(
     """Measures methods action by action.
 
     Args:
-        methods: By name.
+        methods: Methods by name.
         sequences: Actions with their reference cloth; garments that came off the body
             there (see `usable_garment`) are left out.
-        templates: Garments to look at.
-        done: Rows that needn't be measured again.
-        report: Called with a text, rows done and rows in all.
+        templates: Garments to evaluate.
+        done: Rows measured before, which are skipped.
+        report: Called with a text, the rows done and the total.
 
     Yields:
-        A row for each method, action and template, as soon as it is known.
+        A row for each method, action and template, as soon as it is measured.
 
     References:
         PhysXNet, section 5.2 and figures 4 and 5.
@@ -129,7 +128,7 @@ def evaluate(
     jobs: list[tuple[Template, str, Sequence]] = [
         (t, m, s) for t in templates for m in methods for s in sequences if t in s.offsets
     ]
-    rows = _Reference()
+    rows = _ReferenceTables()
     for k, (name, label, sequence) in enumerate(jobs):
         if report is not None:
             report(f"{label}, {sequence.name}, {name}", k, len(jobs))
@@ -147,13 +146,13 @@ def retime(
     *,
     report: Callable[[str, int, int], None] | None = None,
 ) -> Iterator[ActionError]:
-    """Rows with their times measured again, one after another: ratios want one quiet hour.
+    """Measures the times of rows again, one after another, so that their ratios are comparable.
 
     Args:
-        methods: By name; rows of others are passed on as they are.
+        methods: Methods by name; rows of other methods are yielded unchanged.
         sequences: The actions of the rows.
-        rows: What was measured before.
-        report: Called with a text, rows done and rows in all.
+        rows: Rows measured before.
+        report: Called with a text, the rows done and the total.
 
     Yields:
         Every row, in order.
@@ -163,13 +162,13 @@ def retime(
         if report is not None:
             report(f"{row.method}, {row.action}, {row.template}", k, len(rows))
         if row.method in methods and row.action in actions:
-            answer = methods[row.method](actions[row.action].motion, row.template)  # pyright: ignore[reportArgumentType]
-            row = dataclasses.replace(row, ms_per_frame=answer.ms_per_frame)
+            prediction = methods[row.method](actions[row.action].motion, row.template)  # pyright: ignore[reportArgumentType]
+            row = dataclasses.replace(row, ms_per_frame=prediction.ms_per_frame)
         yield row
 
 
-class _Reference:
-    """What is the same for every method."""
+class _ReferenceTables:
+    """Reference data shared by all methods."""
 
     def __init__(self) -> None:
         self._tables: dict[Template, tuple[Assembly, Transference]] = {}
@@ -189,10 +188,10 @@ class _Reference:
         assembly, to_cloth = self.tables(name)
         motion = sequence.motion
         reference = skinning()(motion, name).positions + sequence.offsets[name]
-        free_programs()
-        answer = method(motion, name)
-        finite = np.asarray(np.isfinite(answer.positions).all(axis=(1, 2)))
-        shown = np.where(finite[:, None, None], answer.positions, 0.0)
+        clear_caches_if_full()
+        prediction = method(motion, name)
+        finite = np.asarray(np.isfinite(prediction.positions).all(axis=(1, 2)))
+        shown = np.where(finite[:, None, None], prediction.positions, 0.0)
         x, y = shown[finite], reference[finite]
         values: dict[str, Any] = dict.fromkeys(
             (f.name for f in dataclasses.fields(ActionError)), float("nan")
@@ -204,7 +203,7 @@ class _Reference:
             "template": name,
             "frames": motion.num_frames,
             "finite_share": float(finite.mean()),
-            "ms_per_frame": answer.ms_per_frame,
+            "ms_per_frame": prediction.ms_per_frame,
             "jitter_reference": jitter(reference, motion.fps),
             "data": str(sequence.meta[name].get("sha256", ""))[:DIGITS],
             "weights": "",
@@ -214,8 +213,8 @@ class _Reference:
         error = vertex_error(x, y)
         gap = np.asarray(to_cloth @ jnp.asarray(x - y))[:, np.asarray(to_cloth.valid)]
         texels = float(np.mean(np.sum((1e3 * gap.astype(np.float64)) ** 2, axis=2)))
-        looked = np.flatnonzero(finite)[::_EVERY]
-        inside = penetration(assembly, motion, shown, frames=looked, bare_skin=False)
+        sampled = np.flatnonzero(finite)[::_PENETRATION_STRIDE]
+        inside = penetration(assembly, motion, shown, frames=sampled, bare_skin=False)
         free = inside.cloth_inside & ~inside.pinched
         faces = np.asarray(assembly.faces)
         strain = np.abs(edge_strain(assembly, x))
@@ -239,7 +238,7 @@ class _Reference:
             "fold_strength": angle_strength(angles[0]) / max(angle_strength(angles[1]), 1e-6),
             "strain_p99_reference": float(np.quantile(np.abs(edge_strain(assembly, y)), 0.99)),
         }
-        # Across a frame that is missing there is no acceleration.
+        # Accelerations across a missing frame are undefined.
         if finite.all():
             values |= {
                 "acceleration_error": acceleration_error(x, y, motion.fps),

@@ -1,4 +1,4 @@
-"""How far a dressed garment is from its reference."""
+"""Vertex errors of a dressed garment against its reference."""
 
 import dataclasses
 
@@ -10,7 +10,7 @@ from jaxtyping import Float
 class VertexError:
     """Distances between two animations of one mesh.
 
-    An MSE has the unit mm^2: the paper's "MSE in mm" can mean either, so both are here.
+    The paper's "MSE in mm" can mean the MSE [mm^2] or its root [mm], so both are given.
 
     Attributes:
         mse_mm2: Mean squared distance of vertices [mm^2].
@@ -35,21 +35,21 @@ def vertex_error(
 
     Args:
         positions: Positions [m].
-        reference: What they should be [m].
+        reference: Reference positions [m].
 
     Returns:
         The error.
 
     Raises:
-        ValueError: Different shapes, or no vertex.
+        ValueError: The shapes differ, or there is no vertex.
 
     References:
         PhysXNet, section 5.2.
     """
     if positions.shape != reference.shape or positions.size == 0:
         raise ValueError(
-            f"positions {positions.shape} and reference {reference.shape} must have one"
-            " shape and at least one vertex."
+            f"positions {positions.shape} and reference {reference.shape} must have the"
+            " same shape and at least one vertex."
         )
     gap = positions.astype(np.float64) - reference
     distance = 1e3 * np.linalg.norm(gap, axis=2)

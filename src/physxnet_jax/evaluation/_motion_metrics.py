@@ -1,4 +1,4 @@
-"""How cloth moves and folds: what a mean distance doesn't show."""
+"""Metrics of cloth motion and folds, which a mean distance doesn't capture."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,10 +11,10 @@ def dihedral_angles(
 ) -> Float[np.ndarray, "frames hinges"]:
     """Angle between the two triangles of every interior edge [rad].
 
-    Its sign tells a fold from its opposite at the same edge, not a ridge from a valley.
+    The sign distinguishes opposite folds of the same edge, not ridges from valleys.
     """
     a, b, left, right = hinges(faces).T
-    # Number by number and frame by frame: what is between stays in the cache.
+    # One component and one frame at a time, so that intermediates stay in the cache.
     out = np.empty((len(positions), len(a)))
     for k, frame in enumerate(np.asarray(positions, np.float64)):
         x = frame.T
@@ -40,9 +40,9 @@ def wrinkle_error(
     positions: Float[np.ndarray, "frames vertices 3"],
     reference: Float[np.ndarray, "frames vertices 3"],
 ) -> float:
-    """Root mean square difference of the angles at the folds [degrees].
+    """Root mean square difference of the dihedral angles [degrees].
 
-    It sees wrinkles that are missing or smoothed away, whatever the mean distance.
+    It detects wrinkles that are missing or smoothed away, whatever the mean distance.
     """
     return angle_error(dihedral_angles(faces, positions), dihedral_angles(faces, reference))
 
@@ -50,7 +50,7 @@ def wrinkle_error(
 def angle_error(
     angles: Float[np.ndarray, "frames hinges"], reference: Float[np.ndarray, "frames hinges"]
 ) -> float:
-    """`wrinkle_error` of angles that are known [degrees]."""
+    """`wrinkle_error` from precomputed angles [degrees]."""
     gap = (angles - reference + np.pi) % (2.0 * np.pi) - np.pi
     return float(np.degrees(np.sqrt(np.mean(gap**2))))
 
@@ -58,16 +58,16 @@ def angle_error(
 def fold_strength(
     faces: Int[np.ndarray, "faces 3"], positions: Float[np.ndarray, "frames vertices 3"]
 ) -> float:
-    """Root mean square of the angles at the folds [degrees], wherever these are.
+    """Root mean square of the dihedral angles [degrees], wherever the folds are.
 
-    `wrinkle_error` asks for the same folds in the same places, and is least where there are
-    none; this tells whether there are any.
+    `wrinkle_error` compares folds in the same places and so favours cloth without folds;
+    this metric measures whether there are any.
     """
     return angle_strength(dihedral_angles(faces, positions))
 
 
 def angle_strength(angles: Float[np.ndarray, "frames hinges"]) -> float:
-    """`fold_strength` of angles that are known [degrees]."""
+    """`fold_strength` from precomputed angles [degrees]."""
     return float(np.degrees(np.sqrt(np.mean(angles**2))))
 
 
@@ -76,7 +76,7 @@ def area_strain(
     faces: Int[np.ndarray, "faces 3"],
     positions: Float[np.ndarray, "frames vertices 3"],
 ) -> Float[np.ndarray, "frames faces"]:
-    """Change of the area of every triangle over its area at rest [1]."""
+    """Relative change of every triangle's area from rest [1]."""
 
     def area(x: np.ndarray) -> np.ndarray:
         a, b, c = (x[..., faces[:, k], :] for k in range(3))
@@ -90,7 +90,7 @@ def acceleration_error(
     reference: Float[np.ndarray, "frames vertices 3"],
     fps: float,
 ) -> float:
-    """Mean length of the difference of accelerations [m/s^2]; 0 below three frames."""
+    """Mean magnitude of the acceleration difference [m/s^2]; 0 below three frames."""
     if len(positions) < 3:
         return 0.0
     gap = positions.astype(np.float64) - reference
@@ -98,9 +98,9 @@ def acceleration_error(
 
 
 def jitter(positions: Float[np.ndarray, "frames vertices 3"], fps: float) -> float:
-    """Mean length of the third derivative of positions, jerk [m/s^3].
+    """Mean magnitude of the jerk, the third derivative of positions [m/s^3].
 
-    Compare it with that of the reference: a body that moves has some.
+    Compare it with that of the reference: a moving body always has some.
 
     References:
         Flash and Hogan, The coordination of arm movements (1985), for jerk as the

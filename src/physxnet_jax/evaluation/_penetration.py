@@ -21,33 +21,34 @@ from ..geometry import (
 from ..motion import Motion, animate
 from ..simulation import Assembly
 
-# Skin that wears cloth has it within this distance at rest [m].
-_UNDER = 0.08
-# Room that skin in the open has above it [m].
-_THIN = 0.005
-# Cloth above skin by this much or less covers it [m].
-_FOLD = 0.03
-# There is room for cloth where other skin is no nearer than this share of its thickness.
-_CLEAR = 0.7
-# Skin rises this little above the tangent plane of a vertex next to it [m].
-_CURVED = 0.01
+# Largest distance at rest between skin and the cloth that covers it [m].
+_MAX_CLOTH_DISTANCE = 0.08
+# Clearance above skin that isn't in a fold [m].
+_OPEN_CLEARANCE = 0.005
+# Cloth covers skin that lies at most this far below it [m].
+_MAX_COVER_HEIGHT = 0.03
+# Cloth has clearance where other skin is no nearer than this share of its thickness.
+_CLEARANCE_SHARE = 0.7
+# Bound on how far skin rises above the tangent plane of a neighbouring vertex [m].
+_MAX_CURVATURE_RISE = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
 class Penetration:
-    """What is on the wrong side, frame by frame.
+    """Penetrations of every frame: cloth inside the body, and skin outside the cloth.
 
     Attributes:
         cloth_inside: Cloth vertices inside the nearest skin or inside any limb, shape
             [frames, vertices].
-        depth: How deep below the nearest skin or the limb's [m], 0 outside, likewise.
-        pinched: Of those inside, cloth with no room above the skin it is worn on: one
-            thickness above, other skin is nearer than that, or the place lies within
-            another limb. The body folds or passes through itself there.
-        skin_outside: Share of the skin's vertices that wear cloth which stick out of
-            its nearest triangle by more than 0.1 mm and have none above within 3 cm,
-            shape [frames]. Skin in a fold or within another limb, with no room for cloth
-            above it, isn't counted.
+        depth: Depth below the nearest skin or below the limb's skin [m], 0 outside, shape
+            [frames, vertices].
+        pinched: Those inside that have no clearance above the skin they are worn on. The
+            point one thickness above that skin lies within another limb, or other skin is
+            nearer to it than that. The body folds or passes through itself there.
+        skin_outside: Share of the covered skin's vertices that stick out of the nearest
+            cloth triangle by more than 0.1 mm and have no cloth within 3 cm above them,
+            shape [frames]. Skin without clearance for cloth above it, in a fold or within
+            another limb, isn't counted.
     """
 
     cloth_inside: Bool[np.ndarray, "frames vertices"]
@@ -64,18 +65,19 @@ def penetration(
     frames: Int[np.ndarray, " looked"] | None = None,
     bare_skin: bool = True,
 ) -> Penetration:
-    """Measures penetration without asking the simulator that made the cloth.
+    """Measures penetration on meshes alone, independently of the cloth's simulator.
 
-    The nearest skin vertex is found among all, and among those of each segment of the
-    body; the closest point among the triangles around it, the sign by the interpolated
-    normal there. A segment's own open ends have no sign.
+    The nearest skin vertex is searched among all vertices, and among those of each body
+    segment. The closest point lies on the triangles around that vertex; the interpolated
+    normal there determines the sign. Points closest to a segment's open end count as outside
+    that segment.
 
     Args:
         assembly: The scene's garments and body.
         motion: The body's motion.
-        positions: Of all garments' vertices [m].
-        frames: Which frames to look at; all by default.
-        bare_skin: Look for skin outside the cloth as well, a third of the time;
+        positions: Vertices of all garments [m].
+        frames: Frames to measure; all by default.
+        bare_skin: Measure skin outside the cloth as well, which takes a third of the time;
             ``skin_outside`` is NaN otherwise.
     """
     looked = np.arange(len(positions)) if frames is None else np.asarray(frames)
@@ -94,37 +96,37 @@ def penetration(
             part,
         )
     )
-    home = assembly.rest_body[:NUM_BODY_VERTICES]
-    own = _nearest(home, assembly.rest)
-    build = _Build(
+    rest_skin = assembly.rest_body[:NUM_BODY_VERTICES]
+    rest_nearest = _nearest(rest_skin, assembly.rest)
+    build = _SkinTopology(
         faces,
         vertex_faces(faces, NUM_BODY_VERTICES),
         body_segments(np.asarray(body.weights)[:NUM_BODY_VERTICES], body),
         _limbs(assembly, faces),
     )
-    under = _Covered(assembly, home) if bare_skin else None
+    under = _CoveredSkin(assembly, rest_skin) if bare_skin else None
     inside, depth, pinched, outside = [], [], [], []
     for s, x in zip(skin, positions[looked], strict=True):
-        posed = _Skin(build, s)
+        posed = _PosedSkin(build, s)
         height = posed.height(x, posed.nearest(x))[0]
         lowest = np.minimum(height, posed.height_in_limbs(x))
         wrong = lowest < 0
         inside.append(wrong)
         depth.append(np.where(wrong, -lowest, 0.0))
-        # Where it is worn: from the nearest skin vertex at rest, over the surface.
+        # The skin it is worn on: a walk over the surface from the nearest vertex at rest.
         rows = np.flatnonzero(wrong)
-        at = _walk(x[rows], s, build.around, faces, own[rows])
-        foot, up = posed.foot(x[rows], at)
+        at = _walk(x[rows], s, build.around, faces, rest_nearest[rows])
+        closest, up = posed.closest(x[rows], at)
         narrow = np.zeros(len(x), bool)
-        narrow[rows] = posed.crowded(foot, up, assembly.thickness[rows], at)
+        narrow[rows] = posed.lacks_clearance(closest, up, assembly.thickness[rows], at)
         pinched.append(narrow)
         outside.append(np.nan if under is None else under.bare(posed, x))
     return Penetration(np.stack(inside), np.stack(depth), np.stack(pinched), np.asarray(outside))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Build:
-    """What of the skin is the same in every frame."""
+class _SkinTopology:
+    """Topology of the skin, which is the same in every frame."""
 
     faces: Int[np.ndarray, "faces 3"]
     around: Int[np.ndarray, "body k"]
@@ -132,17 +134,17 @@ class _Build:
     limbs: "list[_Limb]"
 
 
-class _Skin:
-    """The skin of one frame, and what is asked of it."""
+class _PosedSkin:
+    """The skin of one frame, with distance queries."""
 
-    def __init__(self, build: _Build, vertices: Float[np.ndarray, "body 3"]) -> None:
+    def __init__(self, build: _SkinTopology, vertices: Float[np.ndarray, "body 3"]) -> None:
         self._build, self.vertices = build, vertices
         self.normals = np.asarray(vertex_normals(jnp.asarray(vertices), jnp.asarray(build.faces)))
         self._whole = _tree(vertices)
         self._trees = [_tree(vertices[limb.vertices]) for limb in build.limbs]
 
     def nearest(self, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
-        return _ask(self._whole, points)
+        return _query(self._whole, points)
 
     def height(
         self, points: Float[np.ndarray, "points 3"], near: Int[np.ndarray, " points"]
@@ -151,32 +153,32 @@ class _Skin:
         build = self._build
         return _height(points, self.vertices, self.normals, build.faces, build.around, near)
 
-    def foot(
+    def closest(
         self, points: Float[np.ndarray, "points 3"], near: Int[np.ndarray, " points"]
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The closest points around these vertices [m], and the normals there."""
+        """The closest points on the skin around these vertices [m], and their normals."""
         _, weights, face = self.height(points, near)
         corners = self._build.faces[face]
-        foot, up = (
+        closest, up = (
             np.einsum("pk,pki->pi", weights, a[corners]) for a in (self.vertices, self.normals)
         )
-        return foot, up
+        return closest, up
 
     def height_in_limbs(
         self,
         points: Float[np.ndarray, "points 3"],
         *,
-        but: Int[np.ndarray, " points"] | None = None,
+        exclude: Int[np.ndarray, " points"] | None = None,
     ) -> Float[np.ndarray, " points"]:
-        """Least height over any limb's skin [m], at most 0; not over the segment ``but``."""
+        """Least height over any limb's skin [m], at most 0, without segment ``exclude``."""
         x, s, normal = points, self.vertices, self.normals
         out = np.zeros(len(x))
         for limb, tree in zip(self._build.limbs, self._trees, strict=True):
-            rows = np.arange(len(x)) if but is None else np.flatnonzero(but != limb.segment)
-            far, near = map(np.asarray, tree.query(x[rows], distance_upper_bound=limb.thick))
+            rows = np.arange(len(x)) if exclude is None else np.flatnonzero(exclude != limb.segment)
+            far, near = map(np.asarray, tree.query(x[rows], distance_upper_bound=limb.max_depth))
             rows, near = rows[np.isfinite(far)], limb.vertices[near[np.isfinite(far)]]
-            # Only points beneath the nearest vertex's plane, or nearly, can be inside.
-            under = np.einsum("pi,pi->p", x[rows] - s[near], normal[near]) < _CURVED
+            # Only points below or just above the nearest vertex's tangent plane can be inside.
+            under = np.einsum("pi,pi->p", x[rows] - s[near], normal[near]) < _MAX_CURVATURE_RISE
             rows, near = rows[under], near[under]
             if not len(rows):
                 continue
@@ -185,47 +187,47 @@ class _Skin:
             out[rows] = np.minimum(out[rows], np.where(at_end, 0.0, height))
         return out
 
-    def crowded(
+    def lacks_clearance(
         self,
-        foot: Float[np.ndarray, "points 3"],
+        closest: Float[np.ndarray, "points 3"],
         up: Float[np.ndarray, "points 3"],
-        room: Float[np.ndarray, " points"],
+        clearance: Float[np.ndarray, " points"],
         at: Int[np.ndarray, " points"],
     ) -> Bool[np.ndarray, " points"]:
-        """Whether there is no place at this height above these points of the skin."""
-        above = foot + room[:, None] * up
+        """Whether these points of the skin lack this clearance above them."""
+        above = closest + clearance[:, None] * up
         clear = self.height(above, self.nearest(above))[0]
-        crossed = self.height_in_limbs(above, but=self._build.segment[at]) < 0
-        return crossed | (clear < _CLEAR * room)
+        crossed = self.height_in_limbs(above, exclude=self._build.segment[at]) < 0
+        return crossed | (clear < _CLEARANCE_SHARE * clearance)
 
 
-class _Covered:
-    """The skin that wears cloth at rest, and how much of it shows."""
+class _CoveredSkin:
+    """The skin that cloth covers at rest, and how much of it sticks out."""
 
-    def __init__(self, assembly: Assembly, home: Float[np.ndarray, "body 3"]) -> None:
-        self._assembly, self._home = assembly, home
+    def __init__(self, assembly: Assembly, rest_skin: Float[np.ndarray, "body 3"]) -> None:
+        self._assembly, self._home = assembly, rest_skin
         self._around = vertex_faces(assembly.faces, len(assembly.rest))
         self._rim = np.zeros(len(assembly.rest), bool)
         edges = mesh_edges(assembly.faces)
         self._rim[edges.vertices[edges.count == 1]] = True
-        self._outwards = _outwards(assembly, home)
-        self._clothed = _clothed(assembly, home, self._rim, self._outwards, self._around)
+        self._outwards = _outwards(assembly, rest_skin)
+        self._is_covered = _is_covered(assembly, rest_skin, self._rim, self._outwards, self._around)
 
-    def bare(self, skin: _Skin, x: Float[np.ndarray, "vertices 3"]) -> float:
-        """Share of it that sticks out of the cloth."""
+    def bare(self, skin: _PosedSkin, x: Float[np.ndarray, "vertices 3"]) -> float:
+        """Share of the covered skin that sticks out of the cloth."""
         faces, s = self._assembly.faces, skin.vertices
         under = _nearest(x, s)
-        # Only cloth that is worn on that skin: a hand beside the hip is no hole in it.
-        worn = np.linalg.norm(self._assembly.rest[under] - self._home, axis=1) < _UNDER
-        covered = np.flatnonzero(worn & self._clothed)
+        # Only cloth that is worn on that skin: a hand in front of a hip isn't uncovered.
+        worn = np.linalg.norm(self._assembly.rest[under] - self._home, axis=1) < _MAX_CLOTH_DISTANCE
+        covered = np.flatnonzero(worn & self._is_covered)
         normal = np.asarray(vertex_normals(jnp.asarray(x, jnp.float32), jnp.asarray(faces)))
         normal = normal * self._outwards[:, None]
         up, weights, face = _height(s[covered], x, normal, faces, self._around, under[covered])
-        # A foot on the hem is beside the cloth, not beneath it.
+        # Skin whose closest point lies on the hem is beside the cloth, not beneath it.
         beside = ((weights * self._rim[faces[face]]).sum(axis=1)) > 0.999
         bare = covered[(up > 1e-4) & ~beside]
-        room = np.full(len(bare), _THIN)
-        seen = ~skin.crowded(s[bare], skin.normals[bare], room, bare)
+        clearance = np.full(len(bare), _OPEN_CLEARANCE)
+        seen = ~skin.lacks_clearance(s[bare], skin.normals[bare], clearance, bare)
         seen &= ~_under_cloth(s[bare], skin.normals[bare], x, faces)
         return seen.sum() / max(len(covered), 1)
 
@@ -237,11 +239,11 @@ class _Limb:
     faces: Int[np.ndarray, "faces 3"]
     around: Int[np.ndarray, "body k"]
     rim: Bool[np.ndarray, " body"]
-    thick: float
+    max_depth: float
 
 
 def _limbs(assembly: Assembly, faces: Int[np.ndarray, "faces 3"]) -> list[_Limb]:
-    """The skin's segments as meshes of their own, open where they were joined."""
+    """The skin's segments as separate meshes, open where they join each other."""
     body = assembly.body
     segment = body_segments(np.asarray(body.weights)[:NUM_BODY_VERTICES], body)
     out = []
@@ -271,7 +273,7 @@ def _outwards(assembly: Assembly, skin: Float[np.ndarray, "body 3"]) -> Float[np
     return np.where(total >= 0, 1.0, -1.0)[piece].astype(np.float32)
 
 
-def _clothed(
+def _is_covered(
     assembly: Assembly,
     skin: Float[np.ndarray, "body 3"],
     rim: Bool[np.ndarray, " vertices"],
@@ -283,22 +285,22 @@ def _clothed(
     normal = np.asarray(vertex_normals(jnp.asarray(x), jnp.asarray(assembly.faces)))
     over = _nearest(x, skin)
     up, weights, face = _height(skin, x, normal * outwards[:, None], assembly.faces, around, over)
-    beneath = (up < 0) & (up > -_UNDER)
+    beneath = (up < 0) & (up > -_MAX_CLOTH_DISTANCE)
     return beneath & ((weights * ~rim[assembly.faces[face]]).sum(axis=1) > 0.05)
 
 
 def _tree(points: Float[np.ndarray, "points 3"]) -> KDTree:
-    # Built for every frame and asked once: a balanced one would take longer to build.
+    # Built for every frame and queried once: a balanced tree would take longer to build.
     return KDTree(points, balanced_tree=False, compact_nodes=False)
 
 
 def _nearest(
     of: Float[np.ndarray, "many 3"], to: Float[np.ndarray, "points 3"]
 ) -> Int[np.ndarray, " points"]:
-    return _ask(_tree(of), to)
+    return _query(_tree(of), to)
 
 
-def _ask(tree: KDTree, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
+def _query(tree: KDTree, points: Float[np.ndarray, "points 3"]) -> Int[np.ndarray, " points"]:
     return np.reshape(tree.query(points)[1], len(points))
 
 
@@ -309,7 +311,7 @@ def _walk(
     faces: Int[np.ndarray, "faces 3"],
     at: Int[np.ndarray, " points"],
 ) -> Int[np.ndarray, " points"]:
-    """Along the surface to the skin vertex that has no nearer neighbour."""
+    """Walks along the surface to a skin vertex that has no nearer neighbour."""
     for _ in range(60):
         ring = faces[around[at]].reshape(len(at), 3 * around.shape[1])
         gap = s[ring] - x[:, None]
@@ -326,7 +328,7 @@ def _under_cloth(
     cloth: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
 ) -> Bool[np.ndarray, " points"]:
-    """Whether a ray along each skin normal meets cloth, as under a fold that hangs over."""
+    """Whether a ray along each skin normal hits cloth, as under an overhanging fold."""
     rows = 1 << int(np.ceil(np.log2(max(len(points), 64))))
     pad = ((0, rows - len(points)), (0, 0))
     mesh = make_mesh(np.asarray(cloth, np.float32), faces)
@@ -334,7 +336,7 @@ def _under_cloth(
         mesh,
         jnp.asarray(np.pad(points, pad), jnp.float32),
         jnp.asarray(np.pad(directions, pad), jnp.float32),
-        max_distance=_FOLD,
+        max_distance=_MAX_COVER_HEIGHT,
     )
     return np.asarray(hits.valid)[: len(points)]
 
@@ -347,9 +349,9 @@ def _height(
     around: Int[np.ndarray, "vertices k"],
     near: Int[np.ndarray, " points"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Signed distance to the triangles around a vertex, weights and face of the foot."""
+    """Signed distance to the triangles around a vertex; the closest point's weights and face."""
     patch = around[near]
-    # Rows of one length for many calls: each new shape would be compiled.
+    # Padded to powers of two, because every new shape is compiled.
     rows = 1 << int(np.ceil(np.log2(max(len(points), 1))))
     index = np.pad(faces[patch], ((0, rows - len(points)), (0, 0), (0, 0)))
     p = np.pad(np.asarray(points, np.float32), ((0, rows - len(points)), (0, 0)))
@@ -372,8 +374,8 @@ def _signed(p: Array, mesh: Array, normals: Array, index: Array) -> tuple[Array,
     best = jnp.argmin(squared, axis=1)
     w = jnp.take_along_axis(weights, best[None, :, None], axis=2)[..., 0].T
     corner = jnp.take_along_axis(index, best[:, None, None], axis=1)[:, 0]
-    foot = jnp.einsum("pk,pki->pi", w, mesh[corner], precision=jax.lax.Precision.HIGHEST)
+    closest = jnp.einsum("pk,pki->pi", w, mesh[corner], precision=jax.lax.Precision.HIGHEST)
     normal = jnp.einsum("pk,pki->pi", w, normals[corner], precision=jax.lax.Precision.HIGHEST)
-    gap = p - foot
+    gap = p - closest
     side = jnp.sign(jnp.sum(gap * normal, axis=1))
     return side * jnp.sqrt(jnp.sum(gap * gap, axis=1)), w, best

@@ -1,4 +1,4 @@
-"""What each effect of a scene costs, and what it changes."""
+"""Cost and influence of each effect of a scene."""
 
 import dataclasses
 import math
@@ -11,42 +11,40 @@ import numpy as np
 from ..motion import Motion
 from ..simulation import (
     ROLLOUT_BLOCK,
-    Air,
-    BodyContact,
-    Damping,
     Effect,
-    LayerContact,
     PreparedScene,
     Rollout,
     Scene,
-    SelfContact,
     Solver,
     State,
     advance,
+    make_system,
     prepare_scene,
     simulate_batch,
 )
+from ..simulation.effects import Air, BodyContact, Damping, LayerContact, SelfContact
 from ._penetration import penetration
 from ._strain import edge_strain
 
-_LOOKED_AT = 5
+_SAMPLED_FRAMES = 5
 
 
 @dataclasses.dataclass(frozen=True)
 class Price:
-    """A scene without one of its effects, beside the whole scene.
+    """A scene without one of its effects, compared with the whole scene.
 
     Attributes:
         without: The effect left out; empty for the whole scene.
-        frames: Frames that were simulated.
-        rms_mm: Distance to the whole scene's cloth, over vertices and frames [mm].
-        max_mm: Its maximum [mm].
+        frames: Number of simulated frames.
+        rms_mm: RMS distance to the whole scene's cloth, over vertices and frames [mm].
+        max_mm: Maximum of that distance [mm].
         strain_p99: 99th percentile of the strain of edges, over all frames.
-        inside_share: Share of vertices inside the body, in some of the frames.
-        ms_per_frame: Median time [ms], warm.
-        mflop: Of the program as XLA counts them, every loop's body once: a frame of one
-            block of one substep [Mflop].
-        cold_s: Time of the first frames with their compilation [s].
+        inside_share: Share of vertices inside the body in sampled frames, pinched ones
+            excluded.
+        ms_per_frame: Median warm time [ms].
+        mflop: Floating-point operations of the program as counted by XLA, which counts
+            every loop's body once: a frame of one contact interval of one substep [Mflop].
+        cold_s: Time of the first frames, including compilation [s].
     """
 
     without: str
@@ -62,12 +60,12 @@ class Price:
 
 @dataclasses.dataclass(frozen=True)
 class Advice:
-    """Whether an effect is called for.
+    """Whether a scene needs an effect.
 
     Attributes:
-        effect: Its name.
-        needed: It changes more than the tolerance.
-        why: What was measured.
+        effect: Name of the effect.
+        needed: Whether it changes the cloth by more than the tolerance.
+        why: The measurements, as text.
     """
 
     effect: str
@@ -86,9 +84,9 @@ def price_effects(
 
     Args:
         scene: The scene.
-        motion: The motion; a second of it says much.
-        solver: How the cloth moves.
-        progress: Called with variants done and variants in all.
+        motion: The motion; one second is already informative.
+        solver: The solver.
+        progress: Called with the variants done and the total.
 
     Returns:
         The whole scene's row, then one for each effect.
@@ -121,18 +119,18 @@ def recommend_effects(
     rows: Sequence[Price] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Advice]:
-    """Which effects matter for a scene, by measurement.
+    """Measures which effects matter for a scene.
 
-    Those it has are left out one by one (`price_effects`); of those it hasn't, drag of
-    still air, self-contact and contact of layers are put in.
+    The scene's effects are left out one by one (`price_effects`). Drag of still air,
+    self-contact and layer contact are added one by one if the scene lacks them.
 
     Args:
         scene: The scene.
         motion: The motion.
-        solver: How the cloth moves.
-        tolerance: What matters: a difference of the mean vertex [m].
-        rows: What `price_effects` gave, if it was called before.
-        progress: Called with variants done and variants in all.
+        solver: The solver.
+        tolerance: RMS distance of the cloth above which an effect matters [m].
+        rows: Result of `price_effects`, if it was called before.
+        progress: Called with the variants done and the total.
     """
     rows = price_effects(scene, motion, solver=solver, progress=progress) if rows is None else rows
     base = rows[0]
@@ -145,8 +143,8 @@ def recommend_effects(
             Advice(
                 r.without,
                 needed,
-                f"Without it the cloth is {r.rms_mm:.1f} mm elsewhere, {100 * inside:+.1f} % of it"
-                f" inside the body, strain {100 * strain:+.0f} %; it costs"
+                f"Without it the cloth moves by {r.rms_mm:.1f} mm (inside the body"
+                f" {100 * inside:+.1f} %, strain {100 * strain:+.0f} %); it costs"
                 f" {base.ms_per_frame - r.ms_per_frame:.1f} ms a frame.",
             )
         )
@@ -160,20 +158,20 @@ def recommend_effects(
     for k, e in enumerate(extra):
         if whole is None:
             whole = _measure(scene, motion, solver, None, "")[1]
-        at = next(
+        position = next(
             (i for i, x in enumerate(scene.effects) if isinstance(x, BodyContact)),
             len(scene.effects),
         )
-        effects = (*scene.effects[:at], e, *scene.effects[at:])
+        effects = (*scene.effects[:position], e, *scene.effects[position:])
         if isinstance(e, Air):
-            # Damping stands for it.
+            # Damping approximates air drag, so Air replaces it.
             effects = tuple(x for x in effects if not isinstance(x, Damping))
         row, rollout = _measure(
             dataclasses.replace(scene, effects=effects), motion, solver, whole, ""
         )
         name = type(e).__name__
-        said = (
-            f"With it the cloth is {row.rms_mm:.1f} mm elsewhere; it costs"
+        reason = (
+            f"With it the cloth moves by {row.rms_mm:.1f} mm; it costs"
             f" {row.ms_per_frame - base.ms_per_frame:.1f} ms a frame."
         )
         needed = row.rms_mm > 1e3 * tolerance
@@ -181,11 +179,11 @@ def recommend_effects(
             least = float(rollout.diagnostics["self_gap"].min())
             if least >= e.gap:
                 needed = False
-                near = "nearer to itself than is watched"
+                near = "within the search range of self-contact"
                 if math.isfinite(least):
                     near = f"nearer to itself than {1e3 * least:.1f} mm"
-                said = f"Cloth never comes {near}."
-        out.append(Advice(name, needed, said))
+                reason = f"Cloth never comes {near}."
+        out.append(Advice(name, needed, reason))
         advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
         if progress is not None:
             progress(k + 1, len(extra))
@@ -206,8 +204,8 @@ def _measure(
     gap = np.zeros(1)
     if whole is not None:
         gap = np.linalg.norm(x - np.concatenate(whole.positions, axis=1), axis=2)
-    looked = np.linspace(0, len(x) - 1, min(_LOOKED_AT, len(x))).astype(int)
-    inside = penetration(prepared.assembly, motion, x, frames=looked)
+    sampled = np.linspace(0, len(x) - 1, min(_SAMPLED_FRAMES, len(x))).astype(int)
+    inside = penetration(prepared.assembly, motion, x, frames=sampled)
     return (
         Price(
             name,
@@ -225,15 +223,15 @@ def _measure(
 
 
 def program_flops(scene: PreparedScene, solver: Solver, fps: float) -> float:
-    """Floating point operations of a frame's program, every loop's body counted once."""
-    system = scene.system(solver)
+    """Floating-point operations of a frame's program, with every loop's body counted once."""
+    system = make_system(scene, solver)
     n, joints = len(scene.assembly.rest), len(scene.assembly.body.joint_names)
     x = jnp.zeros((n, 3, 1), solver.precision)
     state = State(
         x,
         x,
-        solver.remember(x, 1.0 / (fps * solver.substeps)),
-        tuple(e.initial(1) for e in system.effects),
+        solver.init_state(x, 1.0 / (fps * solver.substeps)),
+        tuple(e.init_state(1) for e in system.effects),
     )
     frame = advance.lower(
         system,

@@ -1,4 +1,4 @@
-"""Strain of cloth, measured on positions alone."""
+"""Edge strain of cloth, computed from positions alone."""
 
 import numpy as np
 from jaxtyping import Float
@@ -10,7 +10,7 @@ from ..simulation import Assembly
 def edge_strain(
     assembly: Assembly, positions: Float[np.ndarray, "frames vertices 3"]
 ) -> Float[np.ndarray, "frames edges"]:
-    """Change of the length of every edge over its length at rest [1]."""
+    """Relative change of every edge's length from rest [1]."""
     a, b = mesh_edges(assembly.faces).vertices.T
     rest = np.linalg.norm(assembly.rest[a] - assembly.rest[b], axis=1)
     length = np.linalg.norm(positions[:, a] - positions[:, b], axis=2)

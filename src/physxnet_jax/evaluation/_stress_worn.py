@@ -1,4 +1,4 @@
-"""Hard cases of clothes on a body."""
+"""Stress tests of clothes on a body."""
 
 import dataclasses
 from collections.abc import Callable, Iterator
@@ -14,15 +14,14 @@ from ..motion import Motion, load_motion
 from ..simulation import (
     STANDARD,
     XPBD,
-    BodyContact,
-    Pin,
     Rollout,
     Scene,
     Status,
     prepare_scene,
+    settle_on_static_body,
     simulate_batch,
-    simulate_still,
 )
+from ..simulation.effects import BodyContact, Pin
 from ._penetration import penetration
 from ._strain import edge_strain
 from ._stress import bad_frames, case
@@ -32,13 +31,13 @@ _LAST_STRAIN = "99 % of edges at the end (strain)"
 _LAST_INSIDE = "vertices inside at the end (%)"
 
 
-def _worn(motion: Motion, name: Template = "top") -> Rollout:
+def _run(motion: Motion, name: Template = "top") -> Rollout:
     return simulate_batch(prepare_scene(Scene((template(name),), STANDARD)), [motion])[0]
 
 
 @dataclasses.dataclass(frozen=True)
-class _Act:
-    """What is worn, how its wearer moves, and the bound of the strain at the end."""
+class _PeerCase:
+    """A case: the garment, the motion, and the bound of the strain at the end."""
 
     garment: Template
     motion: Callable[[], Motion]
@@ -48,7 +47,7 @@ class _Act:
 def _outcome(
     name: Template, motion: Motion, positions: Float[np.ndarray, "frames vertices 3"]
 ) -> dict[str, float]:
-    """What can be told of any simulator's answer from its vertices alone."""
+    """Quantities that are measured on any simulator's vertices alone."""
     finite = np.isfinite(positions).all(axis=(1, 2))
     out = {"frames not finite": float((~finite).sum())}
     if not finite.all():
@@ -63,24 +62,24 @@ def _outcome(
 
 
 def run_peer(name: str, engine: Callable[[Scene, Motion], Rollout]) -> dict[str, float]:
-    """A case of `PEER_CASES` in another simulator: its quantities by name.
+    """Runs a case of `PEER_CASES` in an external simulator and returns quantities by name.
 
     Args:
-        name: Of the case.
+        name: Name of the case.
         engine: `simulate_blender` or `simulate_newton`.
     """
-    act = PEER_CASES[name]
-    motion = act.motion()
-    out = engine(Scene((template(act.garment),)), motion)
-    return _outcome(act.garment, motion, out.positions[0])
+    peer = PEER_CASES[name]
+    motion = peer.motion()
+    out = engine(Scene((template(peer.garment),)), motion)
+    return _outcome(peer.garment, motion, out.positions[0])
 
 
-def _ours(name: str) -> tuple[Rollout, Iterator[tuple[str, float, float]]]:
-    act = PEER_CASES[name]
-    motion = act.motion()
-    out = _worn(motion, act.garment)
-    seen = _outcome(act.garment, motion, out.positions[0])
-    bounds = {"frames not finite": 0.0, _LAST_STRAIN: act.strain, _LAST_INSIDE: 0.5}
+def _run_own(name: str) -> tuple[Rollout, Iterator[tuple[str, float, float]]]:
+    peer = PEER_CASES[name]
+    motion = peer.motion()
+    out = _run(motion, peer.garment)
+    seen = _outcome(peer.garment, motion, out.positions[0])
+    bounds = {"frames not finite": 0.0, _LAST_STRAIN: peer.strain, _LAST_INSIDE: 0.5}
     return out, iter([(k, bounds[k], v) for k, v in seen.items()])
 
 
@@ -102,7 +101,7 @@ def start_ten_millimetres_inside() -> Iterator[tuple[str, float, float]]:
     tri = np.asarray(mesh.faces)[np.asarray(hit.face)]
     foot = np.einsum("vk,vkc->vc", np.asarray(hit.weights), np.asarray(mesh.vertices)[tri])
     away = (x - foot) / np.linalg.norm(x - foot, axis=1, keepdims=True)
-    out = simulate_still(scene, 5, solver=XPBD(32, 4), start=foot - 0.010 * away)
+    out = settle_on_static_body(scene, 5, solver=XPBD(32, 4), start=foot - 0.010 * away)
     yield "frames not finite", 0, bad_frames(out)
     yield "deepest after a frame (mm)", 1.0, 1e3 * float(out.diagnostics["penetration_max"][0])
     yield "greatest speed later (m/s)", 1.5, float(out.diagnostics["speed_max"][1:].max())
@@ -115,8 +114,8 @@ def _late_spin() -> Motion:
 
 @case
 def first_frame_far_from_rest() -> Iterator[tuple[str, float, float]]:
-    """A clip that begins in the middle of a spin: the lead-in has to reach it."""
-    out, rows = _ours("first_frame_far_from_rest")
+    """A clip starts in the middle of a spin: the warmup has to reach that pose."""
+    out, rows = _run_own("first_frame_far_from_rest")
     yield from rows
     yield from _body_rows(out)
     yield "99 % of edges in the first frame (strain)", 0.35, float(out.diagnostics["strain_p99"][0])
@@ -124,10 +123,10 @@ def first_frame_far_from_rest() -> Iterator[tuple[str, float, float]]:
 
 @case
 def a_minute_of_turns() -> Iterator[tuple[str, float, float]]:
-    """1,800 frames: a person who sways and turns, cut together from a clip and back."""
+    """1,800 frames of swaying and turning: a clip played forwards and backwards."""
     m = load_motion("side step", fps=_FPS)
     n = m.num_frames
-    # Forth and back, so that no frame is far from the one before.
+    # Forwards and backwards, so that consecutive frames stay close.
     index = np.abs((np.arange(1800) + n - 1) % (2 * (n - 1)) - (n - 1))
     long = dataclasses.replace(
         m, rotations=jnp.asarray(m.rotations)[index], root=jnp.asarray(m.root)[index]
@@ -141,17 +140,17 @@ def a_minute_of_turns() -> Iterator[tuple[str, float, float]]:
 
 def _fast_punch() -> Motion:
     m = load_motion("punch", fps=_FPS)
-    # A third of a second to recover in.
+    # The last frame is held for a third of a second, so that the cloth can recover.
     index = np.append(np.arange(0, m.num_frames, 8), np.full(10, m.num_frames - 1))
     return dataclasses.replace(m, rotations=m.rotations[index], root=m.root[index])
 
 
 @case
 def standing_still() -> Iterator[tuple[str, float, float]]:
-    """A dress on a body that doesn't move: it comes to rest and stays there."""
+    """A dress on a static body comes to rest and stays at rest."""
     m = load_motion("balance", fps=_FPS)
     index = np.zeros(60, int)
-    out = _worn(dataclasses.replace(m, rotations=m.rotations[index], root=m.root[index]), "dress")
+    out = _run(dataclasses.replace(m, rotations=m.rotations[index], root=m.root[index]), "dress")
     yield from _body_rows(out)
     x = out.positions[0][-20:].astype(np.float64)
     acceleration = np.linalg.norm(np.diff(x, n=2, axis=0), axis=2) * _FPS**2
@@ -161,7 +160,7 @@ def standing_still() -> Iterator[tuple[str, float, float]]:
 
 @case
 def limbs_at_eight_times_their_speed() -> Iterator[tuple[str, float, float]]:
-    out, rows = _ours("limbs_at_eight_times_their_speed")
+    out, rows = _run_own("limbs_at_eight_times_their_speed")
     yield from rows
     yield from _body_rows(out)
 
@@ -175,7 +174,7 @@ def _teleport() -> Motion:
 
 @case
 def a_teleport_of_two_metres() -> Iterator[tuple[str, float, float]]:
-    out, rows = _ours("a_teleport_of_two_metres")
+    out, rows = _run_own("a_teleport_of_two_metres")
     yield from rows
     yield from _body_rows(out)
     calm = np.flatnonzero(out.diagnostics["strain_p99"][10:] < 0.3)
@@ -199,18 +198,18 @@ def _pressed_arms() -> Motion:
 
 @case
 def closed_armpits_and_crossed_arms() -> Iterator[tuple[str, float, float]]:
-    """The arms go through the trunk, which no cloth can separate."""
-    out, rows = _ours("closed_armpits_and_crossed_arms")
+    """The arms pass through the trunk, so that no cloth fits between them."""
+    out, rows = _run_own("closed_armpits_and_crossed_arms")
     yield from rows
     yield from _body_rows(out)
     yield "greatest speed (m/s)", 20.0, float(out.diagnostics["speed_max"].max())
     yield "pinching unnoticed (1 = yes)", 0, float(not (out.status & Status.PINCHED).any())
 
 
-PEER_CASES: dict[str, _Act] = {
-    "first_frame_far_from_rest": _Act("bottom", _late_spin),
-    "limbs_at_eight_times_their_speed": _Act("top", _fast_punch, strain=0.4),
-    "a_teleport_of_two_metres": _Act("bottom", _teleport),
-    "closed_armpits_and_crossed_arms": _Act("top", _pressed_arms),
+PEER_CASES: dict[str, _PeerCase] = {
+    "first_frame_far_from_rest": _PeerCase("bottom", _late_spin),
+    "limbs_at_eight_times_their_speed": _PeerCase("top", _fast_punch, strain=0.4),
+    "a_teleport_of_two_metres": _PeerCase("bottom", _teleport),
+    "closed_armpits_and_crossed_arms": _PeerCase("top", _pressed_arms),
 }
-"""Cases that other simulators run too."""
+"""Cases that external simulators run as well."""

@@ -7,11 +7,11 @@ from ._evaluate import ActionError, means
 
 
 def summary_table(rows: Items[ActionError]) -> str:
-    """One line a method: mean RMSE over actions for each template, what it costs.
+    """One row per method: mean RMSE over actions for each template, and further means.
 
     ``better than lbs`` counts the pairs of action and template in which a method's RMSE
-    over vertices is below that of skinning; ``strain 99 %`` is how far one edge in a
-    hundred is from its length, over that length.
+    over vertices is below that of skinning; ``strain 99 %`` is the 99th percentile of the
+    absolute strain of edges.
     """
     names = list(dict.fromkeys(r.template for r in rows))
     lines = [
@@ -43,15 +43,15 @@ def summary_table(rows: Items[ActionError]) -> str:
 
 
 def error_tables(rows: Items[ActionError]) -> str:
-    """For each engine: means of every method, then its errors action by action.
+    """For each engine, the means of every method, then the errors action by action.
 
-    ``at most`` is the value of the action in which the column before it is largest.
+    ``at most`` is the maximum over actions of the column before it.
 
     Args:
-        rows: As `evaluate` gives them.
+        rows: Rows of `evaluate`.
 
     Returns:
-        Markdown; all errors are RMSE over vertices [mm] unless a column says otherwise.
+        Markdown; all errors are RMSE over vertices [mm] unless a column states otherwise.
     """
     lines: list[str] = []
     for engine in dict.fromkeys(r.engine for r in rows):

@@ -1,4 +1,4 @@
-"""Textile tests: what a fabric's numbers mean on a laboratory's instruments."""
+"""Standard textile tests of a fabric: drape and bending length."""
 
 import dataclasses
 
@@ -6,23 +6,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..garment import Fabric, free_garment, grid_faces
-from ..simulation import (
-    XPBD,
-    Bend,
-    Damping,
-    Gravity,
-    Implicit,
-    Pin,
-    Scene,
-    Solver,
-    Stretch,
-    prepare_scene,
-    simulate_still,
-)
+from ..simulation import XPBD, Implicit, Scene, Solver, prepare_scene, settle_on_static_body
+from ..simulation.effects import Bend, Damping, Gravity, Pin, Stretch
 
 _SPECIMEN, _SUPPORT = 0.15, 0.09
 _GRAVITY = 9.81
-# A strip as long as this many bending lengths dips its tip by 41.5 degrees.
+# The tip of a strip of this many bending lengths dips by 41.5 degrees.
 _OVERHANG, _DIP = 2.0, np.radians(41.5)
 
 DRAPE_BANDS: dict[str, tuple[float, float, str]] = {
@@ -33,20 +22,20 @@ DRAPE_BANDS: dict[str, tuple[float, float, str]] = {
     "jersey": (15.0, 45.0, "limp class; no single source"),
     "leather": (47.0, 70.0, "Memon et al. (2021): garment leather"),
 }
-"""Published drape coefficients [%] of such fabrics, and where they come from."""
+"""Published ranges of drape coefficients [%] by fabric, with their sources."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Drape:
-    """Outcome of Cusick's test.
+    """Result of Cusick's drape test.
 
     Attributes:
-        coefficient: Shadow beyond the support, of what it would be if flat [%].
-        folds: Around the edge: how often its distance from the axis goes out and in,
-            by the strongest mode.
-        speed: Of the fastest vertex at the end [m/s]: whether it has come to rest.
-        positions: Of the specimen [m], support in the middle, y up.
-        faces: Its triangles.
+        coefficient: Shadow beyond the support, relative to that of the flat specimen [%].
+        folds: Number of folds: the strongest mode of the edge's distance from the axis.
+        speed: Greatest vertex speed at the end [m/s], which shows whether the specimen
+            has come to rest.
+        positions: Vertices of the specimen [m], support in the middle, y up.
+        faces: Triangles of the specimen.
     """
 
     coefficient: float
@@ -59,17 +48,17 @@ class Drape:
 def drape_test(
     fabric: Fabric, *, edge: float = 0.01, seconds: float = 6.0, solver: Solver | None = None
 ) -> Drape:
-    """Cusick's drapemeter: a disc of 30 cm hangs over a support of 18 cm.
+    """Cusick's drape test: a disc of 30 cm hangs over a support of 18 cm.
 
-    The specimen lies flat on the support, which holds it; the ring around it falls and
-    buckles into folds. Its shadow is counted on a grid of a millimetre.
+    The specimen is pinned where it lies on the support; the ring around it falls and
+    buckles into folds. Its shadow is measured on a grid of 1 mm.
 
     Args:
-        fabric: What is tested.
+        fabric: The tested fabric.
         edge: Length of the mesh's edges [m].
-        seconds: Time to come to rest [s].
-        solver: ``XPBD(256, 1)`` by default: with fewer substeps stretching is too soft
-            and the ring sinks (a cotton's 72 % reads 62 % at 64 substeps).
+        seconds: Simulated time to come to rest [s].
+        solver: ``XPBD(256, 1)`` by default. With fewer substeps stretching is too soft
+            and the ring sinks (for cotton, 62 % at 64 substeps instead of 72 %).
 
     References:
         Cusick, The measurement of fabric drape (1968); ISO 9073-9.
@@ -79,12 +68,12 @@ def drape_test(
     specimen = free_garment(v, faces, pinned=held, fabric=fabric)
     effects = (Gravity(), Damping(), Stretch(compression=1.0), Bend(), Pin())
     scene = prepare_scene(Scene((specimen,), effects))
-    # Perfect symmetry wouldn't buckle.
+    # The noise breaks the symmetry: a perfectly symmetric disc wouldn't buckle.
     start = scene.assembly.rest.copy()
     free = np.setdiff1d(np.arange(len(v)), held)
     start[free, 1] += 1e-4 * np.random.default_rng(0).normal(size=len(free))
     solver = XPBD(256, 1) if solver is None else solver
-    out = simulate_still(scene, int(30 * seconds), solver=solver, start=start)
+    out = settle_on_static_body(scene, int(30 * seconds), solver=solver, start=start)
     out.check()
     x = out.positions[0][-1].astype(np.float64)
     x = x - scene.assembly.rest[held].mean(axis=0)
@@ -95,12 +84,12 @@ def drape_test(
 
 @dataclasses.dataclass(frozen=True)
 class Cantilever:
-    """Outcome of the bending length test.
+    """Result of the cantilever test.
 
     Attributes:
-        length: Bending length by the fabric's own numbers, ``(k / w)^(1/3)`` [m].
-        angle: Dip of the tip of a strip twice as long [degrees]; 41.5 is exact.
-        measured: Bending length that Peirce's formula reads from that dip [m].
+        length: Bending length from the fabric's parameters, ``(k / w)^(1/3)`` [m].
+        angle: Dip of the tip of a strip twice as long [degrees]; the exact value is 41.5.
+        measured: Bending length that Peirce's formula gives for that dip [m].
     """
 
     length: float
@@ -109,12 +98,12 @@ class Cantilever:
 
 
 def cantilever_test(fabric: Fabric, *, cells: int = 16, solver: Solver | None = None) -> Cantilever:
-    """A strip of 2.5 cm that hangs over an edge by twice its bending length.
+    """Cantilever test: a strip 2.5 cm wide overhangs an edge by twice its bending length.
 
     Args:
-        fabric: What is tested.
-        cells: Along the overhang.
-        solver: Backward Euler with long steps by default: only rest matters.
+        fabric: The tested fabric.
+        cells: Number of mesh cells along the overhang.
+        solver: Backward Euler with long steps by default: only the equilibrium matters.
 
     References:
         Peirce, The handle of cloth as a measurable quantity (1930): a strip of length L
@@ -136,7 +125,7 @@ def cantilever_test(fabric: Fabric, *, cells: int = 16, solver: Solver | None = 
     scene = prepare_scene(Scene((strip,), effects))
     if solver is None:
         solver = Implicit(4, 1, order=1, newton=3, iterations=300, tolerance=1e-6)
-    out = simulate_still(scene, 40, solver=solver, fps=10.0)
+    out = settle_on_static_body(scene, 40, solver=solver, fps=10.0)
     out.check()
     y = out.positions[0][-1].reshape(rows, columns, 3) - scene.assembly.rest[2 * columns]
     tip = y[-1].mean(axis=0)
@@ -148,7 +137,7 @@ def cantilever_test(fabric: Fabric, *, cells: int = 16, solver: Solver | None = 
 def _disc(
     radius: float, edge: float
 ) -> tuple[Float[np.ndarray, "vertices 3"], Int[np.ndarray, "faces 3"]]:
-    """A level disc of equilateral triangles with a round rim."""
+    """A horizontal disc of equilateral triangles with a round rim."""
     from scipy.spatial import Delaunay
 
     n = int(np.ceil(radius / edge)) + 1
@@ -156,14 +145,14 @@ def _disc(
     p = edge * np.column_stack([(i + 0.5 * j).ravel(), (np.sqrt(3) / 2 * j).ravel()])
     p = p[np.hypot(p[:, 0], p[:, 1]) < radius - 0.6 * edge]
     count = round(2 * np.pi * radius / edge)
-    turn = 2 * np.pi * np.arange(count) / count
-    p = np.concatenate([p, radius * np.column_stack([np.cos(turn), np.sin(turn)])])
+    angles = 2 * np.pi * np.arange(count) / count
+    p = np.concatenate([p, radius * np.column_stack([np.cos(angles), np.sin(angles)])])
     faces = Delaunay(p).simplices
     return np.column_stack([p[:, 0], np.zeros(len(p)), p[:, 1]]), faces.astype(np.int64)
 
 
 def _shadow(x: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> float:
-    """Area of the vertical projection [m^2]; what overlaps counts once."""
+    """Area of the vertical projection [m^2]; overlaps count once."""
     step, half = 0.001, 0.17
     n = round(2 * half / step)
     dark = np.zeros((n, n), bool)
@@ -185,7 +174,7 @@ def _shadow(x: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"
 
 
 def _folds(rest: Float[np.ndarray, "vertices 3"], x: Float[np.ndarray, "vertices 3"]) -> int:
-    """The strongest mode of the rim's distance from the axis: how often it goes out and in."""
+    """Number of folds: the strongest Fourier mode of the rim's distance from the axis."""
     rim = np.flatnonzero(np.hypot(rest[:, 0], rest[:, 2]) > 0.999 * _SPECIMEN)
     rim = rim[np.argsort(np.arctan2(rest[rim, 2], rest[rim, 0]))]
     r = np.hypot(x[rim, 0], x[rim, 2])

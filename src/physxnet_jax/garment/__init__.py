@@ -1,21 +1,26 @@
-"""Garments: templates, fitting and materials. Knows nothing of simulation."""
+"""Garments: templates, fitting and materials, independent of simulation."""
 
+from ._align import align_to_template as align_to_template
 from ._decimate import decimate as decimate
-from ._fit import (
-    clearance as clearance,
-    lift_out as lift_out,
-    set_clearance as set_clearance,
-    smoothing_matrix as smoothing_matrix,
-)
+from ._fit import clearance as clearance, lift_out as lift_out
 from ._garment import (
-    COTTON as COTTON,
     FABRICS as FABRICS,
     TEMPLATES as TEMPLATES,
     Fabric as Fabric,
     Garment as Garment,
     Template as Template,
-    carried_weights as carried_weights,
 )
+from ._load import (
+    ELSEWHERE as ELSEWHERE,
+    HANGS as HANGS,
+    LONG as LONG,
+    NEAREST as NEAREST,
+    carried as carried,
+    guess_template as guess_template,
+    hangs_off as hangs_off,
+    load_garment as load_garment,
+)
+from ._locate import locate_on_body as locate_on_body
 from ._repair import (
     MeshHealth as MeshHealth,
     clean as clean,
@@ -30,8 +35,18 @@ from ._sheet import (
     grid_faces as grid_faces,
     square_sheet as square_sheet,
 )
+from ._skinned import (
+    SkinnedGarment as SkinnedGarment,
+    make_skinned as make_skinned,
+    skin_garment as skin_garment,
+)
 from ._templates import (
     build_template as build_template,
     stored_arrays as stored_arrays,
     template as template,
+)
+from ._wear import (
+    parse_wear as parse_wear,
+    with_default_fabric as with_default_fabric,
+    with_fabric as with_fabric,
 )

@@ -1,25 +1,25 @@
-"""Cutting meshes along level sets, with every new vertex a mixture of old ones."""
+"""Cuts meshes along level sets; every new vertex is a convex combination of old ones."""
 
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
-# An old vertex this near to the cut, as a share of an edge, moves onto it: no slivers.
+# Vertices this close to the cut (fraction of an edge) snap to it, which avoids slivers.
 _SNAP = 0.35
 
 
 def split_quads(
     quads: Int[np.ndarray, "quads 4"], num_vertices: int
 ) -> tuple[sp.csr_matrix, Int[np.ndarray, "faces 3"]]:
-    """Four triangles a quad, around its centre: no diagonal is preferred.
+    """Splits each quad into four triangles around its centre; no diagonal is preferred.
 
     Args:
         quads: Vertex indices.
-        num_vertices: Length of what they point into.
+        num_vertices: Number of vertices that they index.
 
     Returns:
-        Rows that mix old vertices into new ones (used old ones, then centres), and
-        triangles over the rows.
+        A matrix of convex combinations, one row per new vertex (used old vertices, then
+        centres), and triangles over its rows.
     """
     used = np.unique(quads)
     local = np.full(num_vertices, -1)
@@ -44,19 +44,19 @@ def cut(
     faces: Int[np.ndarray, "faces 3"],
     field: Float[np.ndarray, " vertices"],
 ) -> tuple[sp.csr_matrix, Int[np.ndarray, "pieces 3"], Int[np.ndarray, " kept"]]:
-    """The part of a mesh where a field is negative, with its border on the zero level.
+    """Keeps the part of a mesh where a field is negative, with its border on the zero level.
 
-    Vertices close to the level are moved onto it along their shortest crossing edge;
-    the edges that still cross get a vertex there.
+    Vertices close to the level snap to it along the edge whose crossing is nearest, as a
+    fraction of the edge. Edges that still cross the level get a new vertex on it.
 
     Args:
-        rows: Mixtures that make the vertices.
+        rows: Convex combinations that define the vertices, one row each.
         faces: Triangles.
         field: Value at each vertex; linear along edges.
 
     Returns:
-        Mixtures and triangles of the part kept, and for each of its vertices the old
-        vertex it was, -1 for new ones.
+        Rows and triangles of the kept part, and the old index of each of its vertices, -1
+        for new ones.
     """
     f = np.asarray(field, dtype=np.float64).copy()
     edges = np.unique(
@@ -111,7 +111,7 @@ def cut(
 def pad_rows(
     rows: sp.csr_matrix,
 ) -> tuple[Int[np.ndarray, "vertices k"], Float[np.ndarray, "vertices k"]]:
-    """Mixtures as index and weight tables, padded with zero weights."""
+    """Converts sparse rows to index and weight tables, padded with zero weights."""
     rows = sp.csr_matrix(rows)
     rows.sum_duplicates()
     indptr, indices, data = (np.asarray(x) for x in (rows.indptr, rows.indices, rows.data))
@@ -131,16 +131,16 @@ def refine(
     rest: Float[np.ndarray, "all 3"],
     max_edge: float,
 ) -> tuple[sp.csr_matrix, Int[np.ndarray, "pieces 3"]]:
-    """Halves edges longer than a limit, the longest of each face first.
+    """Bisects edges longer than a limit, the longest of each face first.
 
     Args:
-        rows: Mixtures that make the vertices.
+        rows: Convex combinations that define the vertices, one row each.
         faces: Triangles.
-        rest: What the rows mix [m].
+        rest: Positions that the rows combine [m].
         max_edge: Longest edge allowed [m].
 
     Returns:
-        Mixtures and triangles; new vertices are edge midpoints, at the end.
+        Rows and triangles; new vertices are edge midpoints and come last.
 
     References:
         Rivara, Mesh refinement by longest edge bisection (1984).
@@ -156,17 +156,17 @@ def refine(
         long = length[lane, longest] > max_edge
         if not long.any():
             return rows, faces
-        # An edge is halved in this pass if it is the longest of every face beside it.
+        # An edge is bisected in this pass if it is the longest of every adjacent face.
         all_keys = np.sort(sides, axis=2).reshape(-1, 2)
-        wanted = np.unique(key[long], axis=0)
+        long_edges = np.unique(key[long], axis=0)
         edges, inverse = np.unique(all_keys, axis=0, return_inverse=True)
         inverse = inverse.reshape(-1, 3)
         beside = np.bincount(inverse.ravel(), minlength=len(edges))
-        picks = np.bincount(inverse[lane, longest], minlength=len(edges))
-        agreed = {tuple(e) for e in edges[beside == picks]}
-        chosen = [tuple(e) for e in wanted if tuple(e) in agreed]
+        votes = np.bincount(inverse[lane, longest], minlength=len(edges))
+        consistent = {tuple(e) for e in edges[beside == votes]}
+        chosen = [tuple(e) for e in long_edges if tuple(e) in consistent]
         if not chosen:
-            # The longest edge of all is always the longest of its faces but for ties.
+            # Only ties get here: the longest edge of all is the longest of each of its faces.
             flat = length[lane, longest]
             chosen = [tuple(key[int(np.argmax(np.where(long, flat, 0)))])]
         table = {e: len(p) + k for k, e in enumerate(chosen)}

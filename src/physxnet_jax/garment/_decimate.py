@@ -1,4 +1,4 @@
-"""A mesh of fewer faces that looks like the finer one: its texture and its materials."""
+"""Mesh decimation that keeps texture coordinates and materials."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -9,33 +9,33 @@ from scipy.spatial import KDTree
 from ..errors import MissingDependencyError
 from ..geometry import TriMesh, make_mesh, mesh_edges
 
-# Faces looked at for the nearest one.
-_NEAR = 16
+# Number of candidates in the search for the nearest face.
+_CANDIDATES = 16
 
 
 def decimate(mesh: TriMesh, edge: float) -> tuple[TriMesh, Int[np.ndarray, " fewer"]]:
-    """About as few faces as equilateral ones of an edge length [m] would be.
+    """Decimates a mesh to about the face count of equilateral triangles of an edge length.
 
-    Every corner has the texture coordinates of the nearest point on the piece of the
-    texture that its face is from: seams stay seams, and no face reaches across one.
+    Each corner takes the texture coordinates of the nearest point on the chart that its face
+    comes from. Seams therefore stay seams, and no face spans one.
 
     Args:
-        mesh: The mesh; faces without an area aren't in it (`clean`).
+        mesh: The mesh, without degenerate faces (see `clean`).
         edge: The edge length [m].
 
     Returns:
-        The mesh, and the face before that lies nearest to the middle of each of its faces
-        and faces the same way, shape [fewer].
+        The mesh, and for each of its faces the original face nearest to its centroid among
+        those facing the same way, shape [fewer].
 
     Raises:
-        MissingDependencyError: Without fast-simplification.
+        MissingDependencyError: fast-simplification isn't installed.
     """
     from trimesh import triangles
 
     x, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     area = float(triangles.area(x[faces]).sum())
-    wanted = max(int(area / (np.sqrt(3.0) / 4.0 * edge**2)), 4)
-    if wanted >= len(faces):
+    target_faces = max(int(area / (np.sqrt(3.0) / 4.0 * edge**2)), 4)
+    if target_faces >= len(faces):
         return mesh, np.arange(len(faces))
     try:
         import fast_simplification
@@ -43,32 +43,34 @@ def decimate(mesh: TriMesh, edge: float) -> tuple[TriMesh, Int[np.ndarray, " few
         raise MissingDependencyError(
             "Decimating needs fast-simplification: pip install 'physxnet-jax[mesh]'."
         ) from error
-    points, fewer = fast_simplification.simplify(x, faces.astype(np.int32), target_count=wanted)[:2]
+    points, fewer = fast_simplification.simplify(
+        x, faces.astype(np.int32), target_count=target_faces
+    )[:2]
     points, fewer = np.asarray(points, np.float64), np.asarray(fewer, np.int64)
-    origin = _origins(x[faces], points[fewer])
+    origin = _origin_faces(x[faces], points[fewer])
     if mesh.uv is None or mesh.uv_faces is None:
         return make_mesh(points, fewer), origin
     uv, chart = np.asarray(mesh.uv, np.float64), np.asarray(mesh.uv_faces, np.int64)
-    seen = _texture(x[faces], uv[chart], chart, points[fewer], origin)
+    seen = _interpolate_uv(x[faces], uv[chart], chart, points[fewer], origin)
     rows, corner = np.unique(seen.reshape(-1, 2).astype(np.float32), axis=0, return_inverse=True)
     return make_mesh(points, fewer, rows, corner.reshape(-1, 3)), origin
 
 
-def _origins(
+def _origin_faces(
     fine: Float[np.ndarray, "faces 3 3"], coarse: Float[np.ndarray, "fewer 3 3"]
 ) -> Int[np.ndarray, " fewer"]:
-    """The fine face nearest to the middle of each coarse one, of those that face its way."""
+    """The fine face nearest to each coarse centroid, among those facing the same way."""
     from trimesh import triangles
 
     middle = coarse.mean(axis=1)
-    near = min(_NEAR, len(fine))
+    near = min(_CANDIDATES, len(fine))
     _, found = KDTree(fine.mean(axis=1)).query(middle, k=near)
     found = np.asarray(found).reshape(len(coarse), near)
     flat = found.reshape(-1)
     onto = triangles.closest_point(fine[flat], np.repeat(middle, near, axis=0))
     far = np.linalg.norm(onto.reshape(len(coarse), near, 3) - middle[:, None], axis=2)
     along = np.einsum("fni,fi->fn", _normals(fine)[found], _normals(coarse))
-    # Where none faces its way the nearest has to do.
+    # If none faces the same way, the nearest is taken.
     order = np.lexsort((far, along <= 0.0), axis=1)
     return found[np.arange(len(coarse)), order[:, 0]]
 
@@ -77,7 +79,7 @@ def _normals(corner: Float[np.ndarray, "faces 3 3"]) -> Float[np.ndarray, "faces
     return np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
 
 
-def _texture(
+def _interpolate_uv(
     fine: Float[np.ndarray, "faces 3 3"],
     fine_uv: Float[np.ndarray, "faces 3 2"],
     chart: Int[np.ndarray, "faces 3"],
@@ -86,8 +88,8 @@ def _texture(
 ) -> Float[np.ndarray, "fewer 3 2"]:
     """Texture coordinates of coarse corners, each from the patch around its face's origin.
 
-    A sleeve's texture may meet itself at a seam: what lies on the other side of it is in the
-    same piece, but not joined to the origin within the reach of one face.
+    A chart may meet itself at a seam, as a sleeve's does. Faces beyond such a seam are in the
+    same chart, but not connected to the origin within the reach of one face.
     """
     from trimesh import triangles
 

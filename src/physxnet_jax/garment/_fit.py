@@ -1,4 +1,4 @@
-"""Keeping a garment clear of the skin at rest."""
+"""Clearance between a garment and the skin at rest."""
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +34,7 @@ def clearance(
     """
     vertices, faces = np.asarray(body.vertices), np.asarray(body.faces)
     count = len(points)
-    # Meshes of about the same size share one program.
+    # Padded to a multiple, so that meshes of similar size share a compiled program.
     pick = np.minimum(np.arange(-(-count // _ROWS) * _ROWS), count - 1)
     near = nearby_faces(vertices, faces, np.asarray(points))
     p = jnp.asarray(np.asarray(points)[pick], jnp.float32)
@@ -56,16 +56,16 @@ def set_clearance(
     free: Float[np.ndarray, " vertices"] | None = None,
     iterations: int = 12,
 ) -> Float[np.ndarray, "vertices 3"]:
-    """The garment moved to a wanted distance from the skin, staying smooth.
+    """Moves a garment to a target distance from the skin while keeping it smooth.
 
     Each pass moves vertices along the skin's normal and smooths the displacement
-    over the mesh, so that wrinkles of the body don't print through.
+    over the mesh, so that wrinkles of the body don't show in the cloth.
 
     Args:
         body: Closed body mesh.
         vertices: Garment vertices [m].
         faces: Garment triangles.
-        target: Wanted distance [m].
+        target: Target distance [m].
         free: 1 where the garment may be farther away (it hangs), 0 where it is held
             at the target.
         iterations: Passes.
@@ -95,16 +95,19 @@ def lift_out(
     *,
     iterations: int = 8,
 ) -> tuple[Float[np.ndarray, "vertices 3"], Bool[np.ndarray, " vertices"]]:
-    """A garment whose vertices keep a distance from the skin, and which had to be moved.
+    """Moves a garment out of the skin to a minimum distance.
 
-    What is three times as far away stays where it is, bit for bit.
+    Vertices at three times that distance or more stay bitwise unchanged.
 
     Args:
         body: Closed body mesh.
         vertices: Garment vertices [m].
         faces: Garment triangles.
-        nearest: Wanted distance [m].
+        nearest: Minimum distance [m].
         iterations: Passes of `set_clearance`.
+
+    Returns:
+        New positions [m], and which vertices were closer than the minimum.
     """
     distance, _ = clearance(body, vertices)
     low = distance < nearest
@@ -130,9 +133,9 @@ def bridge_hollows(
     farthest: float,
     iterations: int = 40,
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Lets cloth span hollows of the body, as a taut membrane does.
+    """Makes cloth span hollows of the body, as a taut membrane does.
 
-    Vertices move towards their neighbours' mean where that leads away from the skin.
+    Vertices move towards their neighbours' mean where that leads outwards.
 
     Args:
         body: Closed body mesh.
@@ -154,10 +157,10 @@ def bridge_hollows(
         step = average @ v - v
         normals = np.asarray(vertex_normals(jnp.asarray(v, jnp.float32), jnp.asarray(faces)))
         outwards = np.maximum(np.einsum("vc,vc->v", step, normals), 0.0)
-        # Inside a deep fold the skin's own normals cross: there the cloth's decide.
-        room = np.clip((farthest - distance) / 0.002, 0.0, 1.0)
+        # In deep folds the skin's normals cross: vertices move along the cloth's, by half.
+        headroom = np.clip((farthest - distance) / 0.002, 0.0, 1.0)
         along = np.where((np.einsum("vc,vc->v", away, normals) > 0.0)[:, None], 1.0, 0.5)
-        v += (inner * room * outwards)[:, None] * normals * along
+        v += (inner * headroom * outwards)[:, None] * normals * along
     return v
 
 
@@ -169,17 +172,17 @@ def relax_crossings(
     nearest: float = 0.006,
     rounds: int = 12,
 ) -> Float[np.ndarray, "vertices 3"]:
-    """Smooths the cloth where it crosses itself until it no longer does.
+    """Smooths the cloth around self-intersections.
 
     Args:
         body: Closed body mesh.
         vertices: Garment vertices [m].
         faces: Garment triangles.
-        nearest: Smoothed vertices stay this far from the skin [m].
-        rounds: Attempts; each widens the smoothed region by one ring.
+        nearest: Minimum distance of smoothed vertices from the skin [m].
+        rounds: Largest number of attempts; each widens the smoothed region by one ring.
 
     Returns:
-        New positions [m]; crossings may remain, see `self_intersections`.
+        New positions [m]; intersections may remain, see `self_intersections`.
     """
     v = np.asarray(vertices, dtype=np.float64).copy()
     average = smoothing_matrix(faces, len(v))
@@ -196,14 +199,14 @@ def relax_crossings(
         for _ in range(20):
             v += region[:, None] * (average @ v - v)
         for _ in range(4):
-            lack = np.maximum(nearest - clearance(body, v)[0], 0.0) * (region > 0)
+            deficit = np.maximum(nearest - clearance(body, v)[0], 0.0) * (region > 0)
             normals = vertex_normals(jnp.asarray(v, jnp.float32), jnp.asarray(faces))
-            v += lack[:, None] * np.asarray(normals)
+            v += deficit[:, None] * np.asarray(normals)
     return v
 
 
 def smoothing_matrix(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> sp.csr_matrix:
-    """Averages each vertex with its neighbours, half and half."""
+    """A matrix that averages each vertex with the mean of its neighbours, half and half."""
     e = mesh_edges(faces).vertices
     ones = np.ones(len(e))
     graph = sp.csr_matrix((ones, (e[:, 0], e[:, 1])), (num_vertices, num_vertices))
@@ -221,17 +224,18 @@ def lift_over(
     *,
     passes: int = 30,
 ) -> Float[np.ndarray, "vertices 3"]:
-    """A garment that lies over another one, at rest.
+    """Lifts a garment over another one, at rest.
 
-    What lies lower than the gap over it, or up to 3 cm beneath it, is lifted along its
-    normals: smoothly first, exactly at last. Beyond its borders nothing is.
+    Vertices less than the gap above the inner garment, or up to 3 cm beneath it, move along
+    its normals: smoothly in the first passes, exactly in the last ones. Vertices beyond its
+    borders don't move.
 
     Args:
-        under: The garment beneath.
-        vertices: Of the one over it [m].
-        faces: Its triangles.
-        gap: Wanted height [m].
-        passes: Steps; each lifts by what is lacking then.
+        under: The inner garment.
+        vertices: Vertices of the outer garment [m].
+        faces: Triangles of the outer garment.
+        gap: Target height above the inner garment [m].
+        passes: Number of passes; each corrects the remaining deficit.
     """
     v = np.asarray(vertices, np.float64).copy()
     average = smoothing_matrix(faces, len(v))
@@ -240,16 +244,16 @@ def lift_over(
     for step in range(passes):
         hit = closest_points(under, jnp.asarray(v, jnp.float32))
         corners, share = triangles[np.asarray(hit.face)], np.asarray(hit.weights, np.float64)
-        foot = np.einsum("pk,pkc->pc", share, skin[corners])
+        closest_point = np.einsum("pk,pkc->pc", share, skin[corners])
         up = np.einsum("pk,pkc->pc", share, normals[corners])
         up /= np.maximum(np.linalg.norm(up, axis=1, keepdims=True), 1e-9)
-        height = np.einsum("pc,pc->p", v - foot, up)
-        beside = np.linalg.norm(v - foot - height[:, None] * up, axis=1)
-        lack = np.where((beside < 2e-3) & (height > -0.03), np.maximum(gap - height, 0.0), 0.0)
+        height = np.einsum("pc,pc->p", v - closest_point, up)
+        lateral = np.linalg.norm(v - closest_point - height[:, None] * up, axis=1)
+        deficit = np.where((lateral < 2e-3) & (height > -0.03), np.maximum(gap - height, 0.0), 0.0)
         if step < passes - 6:
-            near = (height < 0.03) & (beside < 0.01)
-            lack = np.where(near, 1.5 * (average @ (average @ lack)), 0.0)
-        v += lack[:, None] * up
+            near = (height < 0.03) & (lateral < 0.01)
+            deficit = np.where(near, 1.5 * (average @ (average @ deficit)), 0.0)
+        v += deficit[:, None] * up
     return v
 
 
@@ -260,16 +264,16 @@ def level_hem(
     *,
     reach: float = 0.09,
 ) -> Float[np.ndarray, "vertices 3"]:
-    """A garment whose lowest border is nowhere higher than this.
+    """Lowers the lowest border of a garment to at most a given height.
 
-    What is above comes down with it, less and less over ``reach``: a harmonic function
-    along the mesh.
+    The mesh above follows. Its displacement is a harmonic function on the mesh that falls to
+    zero over ``reach``.
 
     Args:
         vertices: Garment vertices [m].
         faces: Garment triangles.
-        height: Of the border [m].
-        reach: How far along the mesh anything is moved [m].
+        height: Largest height of the border [m].
+        reach: Distance along the mesh from the border up to which vertices move [m].
     """
     loop = min(boundary_loops(faces), key=lambda rows: vertices[rows, 1].mean())
     drop = np.minimum(height - vertices[loop, 1], 0.0)

@@ -1,4 +1,4 @@
-"""Garments: a rest mesh on the body, its material, pins, and how it follows shape."""
+"""Garments: rest mesh, material, pins and attachment to the body."""
 
 import dataclasses
 from typing import Literal
@@ -16,18 +16,18 @@ TEMPLATES: tuple[Template, ...] = ("top", "bottom", "dress")
 
 @dataclasses.dataclass(frozen=True)
 class Fabric:
-    """What a cloth is made of.
+    """Material parameters of a fabric.
 
     Attributes:
-        density: Mass by area [kg/m^2].
+        density: Mass per area [kg/m^2].
         stretch: Membrane stiffness of springs along edges [N/m].
         bend: Bending stiffness [N m].
         thickness: Gap kept between cloth and skin [m].
         friction: Coulomb coefficient between cloth and skin [1].
         warp: Stiffness of the membrane along the warp [N/m]; ``stretch`` if None.
-        weft: Along the weft [N/m]; ``stretch`` if None.
-        shear: Against a change of the angle between them [N/m]; a thirtieth of
-            ``stretch`` if None: woven threads turn easily about each other.
+        weft: Stiffness of the membrane along the weft [N/m]; ``stretch`` if None.
+        shear: Shear stiffness [N/m]; a thirtieth of ``stretch`` if None, because woven
+            threads rotate easily about each other.
     """
 
     density: float = 0.15
@@ -54,8 +54,11 @@ class Fabric:
 
 
 COTTON = Fabric()
-"""A light woven cotton: 150 g/m^2; bending from the middle of the published range for
-shirtings (1 to 5 x 10^-5 N m), stretching as stiff as 32 substeps carry."""
+"""A light woven cotton of 150 g/m^2.
+
+Bending is from the middle of the published range for shirtings (1 to 5 x 10^-5 N m).
+``stretch`` is as stiff as 32 substeps can resolve.
+"""
 
 FABRICS: dict[str, Fabric] = {
     "cotton": COTTON,
@@ -65,14 +68,14 @@ FABRICS: dict[str, Fabric] = {
     "jersey": Fabric(0.18, 400.0, 4e-6, 0.004, 0.35, 500.0, 250.0, 40.0),
     "leather": Fabric(0.75, 6000.0, 9e-5, 0.006, 0.45, 8000.0, 8000.0, 2500.0),
 }
-"""Fabrics by name; leather is that of garments, soft.
+"""Fabrics by name; ``leather`` is soft garment leather.
 
 Density, bending, warp, weft and shear lie within the ranges that the Kawabata evaluation
 system gives for such cloth (bending 0.02 to 1.5 gf cm^2/cm, shear 0.3 to 4 gf/cm degree,
 secant modulus up to 500 gf/cm; Kawabata, The standardization and analysis of hand
-evaluation, 1980; 1 gf cm^2/cm = 9.8e-5 N m, 1 gf/cm degree = 56 N/m). Within those,
-bending is where Cusick's drape coefficient falls into its published band (`drape_test`).
-``stretch`` is what springs along edges carry at 32 substeps.
+evaluation, 1980; 1 gf cm^2/cm = 9.8e-5 N m, 1 gf/cm degree = 56 N/m). Within those ranges,
+bending puts Cusick's drape coefficient into its published band (`drape_test`).
+``stretch`` is the stiffness that edge springs can resolve at 32 substeps.
 """
 
 
@@ -84,15 +87,15 @@ class Garment:
     Attributes:
         mesh: Rest mesh [m].
         pinned: Vertices that follow the body's skin, shape [vertices].
-        refs: Body (helper) vertices that carry each vertex, shape [vertices, k].
+        refs: Body (helper) vertices that each vertex is attached to, shape [vertices, k].
         ref_weights: Their weights, rows sum to 1, shape [vertices, k].
-        offset: What is added to their weighted mean [m], shape [vertices, 3].
+        offset: Offset from their weighted mean [m], shape [vertices, 3].
         skin: Skinning weights, rows sum to 1, shape [vertices, joints].
         fabric: Material.
-        template: The map this garment is dressed by.
+        template: Template whose map dresses this garment.
         name: Name used in tables and files.
-        polygons: The faces and materials of the file that it came from, to be written
-            again; None where triangles are all there is.
+        polygons: Polygons and materials of the source file, for writing; None if there are
+            only triangles.
     """
 
     mesh: TriMesh
@@ -118,10 +121,10 @@ class Garment:
             rest: `Body.rest_vertices` of that shape [m].
 
         Returns:
-            Positions [m]: the carrying vertices' mean plus the offset.
+            Positions [m]: the weighted mean of the reference vertices plus the offset.
 
         References:
-            MakeHuman's mhclo files carry clothes in the same way.
+            MakeHuman's mhclo files attach clothes in the same way.
         """
         carried = rest[self.refs] * self.ref_weights[:, :, None]
         return jnp.sum(carried, axis=1) + self.offset
@@ -132,6 +135,6 @@ def carried_weights(
     refs: Int[Array, "vertices k"],
     ref_weights: Float[Array, "vertices k"],
 ) -> Float[Array, "vertices joints"]:
-    """Skinning weights of vertices carried by body vertices, rows summing to 1."""
+    """Skinning weights of vertices attached to body vertices; rows sum to 1."""
     mixed = jnp.sum(body_weights[refs] * ref_weights[:, :, None], axis=1)
     return mixed / jnp.sum(mixed, axis=1, keepdims=True)

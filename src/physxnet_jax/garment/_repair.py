@@ -1,6 +1,6 @@
-"""Meshes as people have them, made fit for cloth: welded, cleaned, oriented, refined.
+"""Mesh repair for cloth: welding, cleaning, orienting and subdividing.
 
-Every function keeps texture coordinates with their corners, unless it says otherwise.
+Every function keeps texture coordinates with their corners.
 """
 
 import dataclasses
@@ -24,26 +24,26 @@ from ..geometry import (
 from ._fit import clearance
 
 WELD = 1e-4
-"""Vertices nearer than this are taken for one [m]."""
+"""Vertices closer than this are merged [m]."""
 
-_THIN = 1e-10
-_MOST = 400_000
-_MOST_PAIRS = 20_000_000
+_MIN_AREA = 1e-10
+_MAX_VERTICES = 400_000
+_MAX_PAIRS = 20_000_000
 
 
 @dataclasses.dataclass(frozen=True)
 class MeshHealth:
-    """What a mesh is like, and what usually goes wrong with it.
+    """Statistics and common defects of a mesh.
 
     Attributes:
         vertices: Number of vertices that a face uses.
         faces: Number of triangles.
-        components: Connected parts.
+        components: Number of connected parts.
         openings: Length of each boundary [m], longest first.
         non_manifold_edges: Edges with more than two faces.
-        duplicate_faces: Faces that are there more than once.
-        degenerate_faces: Faces without an area.
-        inconsistent_edges: Edges whose faces run in different senses.
+        duplicate_faces: Faces that occur more than once.
+        degenerate_faces: Faces of zero area.
+        inconsistent_edges: Edges whose faces have inconsistent winding.
         unused_vertices: Vertices that no face uses.
         coincident_vertices: Vertices within `WELD` of another one.
         median_edge: Median length of edges [m].
@@ -67,21 +67,21 @@ class MeshHealth:
 
 
 def mesh_health(mesh: TriMesh) -> MeshHealth:
-    """Counts over a mesh in metres."""
+    """Computes the statistics of a mesh in metres."""
     x, faces = _arrays(mesh)
     used = np.unique(faces)
     report = manifold_report(faces)
     edges = mesh_edges(faces).vertices
     length = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
     labels = connected_components(faces, len(x))[used]
-    around = [
+    lengths = [
         np.linalg.norm(x[loop] - x[np.roll(loop, 1)], axis=1) for loop in boundary_loops(faces)
     ]
     return MeshHealth(
         len(used),
         len(faces),
         len(np.unique(labels)),
-        tuple(sorted((float(a.sum()) for a in around), reverse=True)),
+        tuple(sorted((float(a.sum()) for a in lengths), reverse=True)),
         report["non_manifold_edges"],
         report["duplicate_faces"],
         int((~_has_area(x, faces)).sum()),
@@ -95,20 +95,20 @@ def mesh_health(mesh: TriMesh) -> MeshHealth:
 
 
 def weld(mesh: TriMesh, distance: float = WELD) -> TriMesh:
-    """Vertices within a distance of each other become one, at the first one's place.
+    """Merges vertices within a distance of each other, at the position of the first.
 
     Args:
         mesh: The mesh.
-        distance: Farthest that welded neighbours may lie apart [m].
+        distance: Largest distance between merged neighbours [m].
     """
     x, faces = _arrays(mesh)
     label = _clusters(x, distance)
     _, first = np.unique(label, return_index=True)
-    return _remade(mesh, x[first], label[faces])
+    return _rebuild(mesh, x[first], label[faces])
 
 
 def clean(mesh: TriMesh) -> TriMesh:
-    """Without faces that have no area or are there twice, and without unused vertices."""
+    """Removes faces of zero area, duplicate faces and unused vertices."""
     x, faces = _arrays(mesh)
     keep = _has_area(x, faces)
     _, first = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
@@ -119,40 +119,41 @@ def clean(mesh: TriMesh) -> TriMesh:
         raise MeshError("no face of this mesh has an area: export it again.")
     uv_faces = None if mesh.uv_faces is None else np.asarray(mesh.uv_faces)[keep]
     used, corners = np.unique(faces[keep], return_inverse=True)
-    return _remade(mesh, x[used], corners.reshape(-1, 3), uv_faces)
+    return _rebuild(mesh, x[used], corners.reshape(-1, 3), uv_faces)
 
 
 def orient(mesh: TriMesh, body: TriMesh) -> TriMesh:
-    """Faces that run in one sense in every part, outwards from the body.
+    """Gives every connected part a consistent winding, outwards from the body.
 
     Args:
         mesh: A garment on the body.
         body: The closed body.
     """
     x, faces = _arrays(mesh)
-    sense, part = _senses(faces)
-    turned = np.where(sense[:, None], faces[:, ::-1], faces)
+    flip, part = _windings(faces)
+    turned = np.where(flip[:, None], faces[:, ::-1], faces)
     corner = x[turned]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     _, away = clearance(body, corner.mean(axis=1).astype(np.float32))
     outward = np.bincount(part, np.einsum("fi,fi->f", normal, away))
-    flipped = sense ^ (outward < 0)[part]
+    flipped = flip ^ (outward < 0)[part]
     uv_faces = None
     if mesh.uv_faces is not None:
         uv_faces = np.asarray(mesh.uv_faces)
         uv_faces = np.where(flipped[:, None], uv_faces[:, ::-1], uv_faces)
     out = np.where(flipped[:, None], faces[:, ::-1], faces)
-    return _remade(mesh, x, out, uv_faces)
+    return _rebuild(mesh, x, out, uv_faces)
 
 
 def subdivide(mesh: TriMesh, longest: float) -> tuple[TriMesh, Int[np.ndarray, " finer"]]:
-    """Edges split in the middle until none is longer than a length [m]; no other is touched.
+    """Bisects edges until none is longer than a length [m]; shorter edges stay.
 
     Returns:
-        The mesh, and the face before that each of its faces is a part of, shape [finer].
+        The mesh, and for each of its faces the original face that it is a part of, shape
+        [finer].
 
     Raises:
-        MeshError: It would take more than 400,000 vertices.
+        MeshError: The result would have more than 400,000 vertices.
     """
     x, faces = _arrays(mesh)
     uv = None if mesh.uv is None else np.asarray(mesh.uv, np.float64)
@@ -164,10 +165,10 @@ def subdivide(mesh: TriMesh, longest: float) -> tuple[TriMesh, Int[np.ndarray, "
         long = length > longest
         if not long.any():
             return make_mesh(x, faces, uv, chart), part_of
-        if len(x) + int(long.sum()) > _MOST:
+        if len(x) + int(long.sum()) > _MAX_VERTICES:
             raise MeshError(
-                f"edges of {1e3 * longest:g} mm would take over {_MOST:,} vertices: the longest"
-                f" is {1e3 * length.max():.0f} mm. Choose a longer one."
+                f"edges of {1e3 * longest:g} mm would take over {_MAX_VERTICES:,} vertices: the"
+                f" longest is {1e3 * length.max():.0f} mm. Choose a longer one."
             )
         split = long[edges.of_face]
         if uv is not None and chart is not None:
@@ -181,7 +182,10 @@ def _split(
     faces: Int[np.ndarray, "faces 3"],
     split: Bool[np.ndarray, "faces 3"],
 ) -> tuple[Float[np.ndarray, "more d"], Int[np.ndarray, "finer 3"], Int[np.ndarray, " finer"]]:
-    """Triangles cut at the middles of chosen edges, each opposite to its corner, and their rows."""
+    """Splits triangles at the midpoints of selected edges; edge k is opposite corner k.
+
+    Returns the points, the triangles, and the original triangle of each.
+    """
     edges = mesh_edges(faces)
     chosen = np.zeros(len(edges.vertices), dtype=bool)
     chosen[edges.of_face[split]] = True
@@ -192,7 +196,7 @@ def _split(
     row = np.arange(len(faces))
     out, rows = [faces[~split.any(axis=1)]], [row[~split.any(axis=1)]]
     for k in range(3):
-        # Corner k first; p and q follow, and m_k lies between p and q.
+        # Corner c is followed by p and q; mc is the midpoint of p and q.
         turn = (k + np.arange(3)) % 3
         c, p, q = faces[:, turn].T
         mc, mp, mq = middle[:, turn].T
@@ -212,16 +216,16 @@ def _split(
 def polygons_left(
     polygons: Polygons, vertices: Float[np.ndarray, "before 3"], mesh: TriMesh
 ) -> Polygons | None:
-    """Polygons over a mesh that was welded, cleaned and turned round since.
+    """Maps polygons to a mesh that has been welded, cleaned and oriented since.
 
     Args:
-        polygons: What they were before.
-        vertices: The vertices then, in the same place [m].
-        mesh: The mesh now.
+        polygons: The polygons before these steps.
+        vertices: The vertices before, at the same positions [m].
+        mesh: The mesh after these steps.
 
     Returns:
-        Those that are left, the way round that their triangles are now; None if not
-        every triangle is part of one.
+        The remaining polygons, with the winding of their triangles; None if not every
+        triangle is part of one.
     """
     x, faces = _arrays(mesh)
     far, row = (np.asarray(a) for a in KDTree(x).query(np.asarray(vertices, np.float64)))
@@ -230,7 +234,7 @@ def polygons_left(
     keep, turned, count = [], [], 0
     for p, (start, n) in enumerate(zip(polygons.starts, polygons.counts, strict=True)):
         ring = row[polygons.corners[start : start + n]].tolist()
-        # Cut from either end of a diagonal, triangles have different corners.
+        # A quad may have been split along either diagonal.
         cuts = [ring, ring[1:] + ring[:1]] if n == 4 else [ring]
         for r in cuts:
             fan = [(r[0], r[k], r[k + 1]) for k in range(1, n - 1)]
@@ -254,10 +258,10 @@ def _arrays(
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
-def _remade(
+def _rebuild(
     mesh: TriMesh, x: np.ndarray, faces: np.ndarray, uv_faces: np.ndarray | None = None
 ) -> TriMesh:
-    """A mesh whose corners still have their texture coordinates."""
+    """Rebuilds a mesh, keeping the texture coordinates of its corners."""
     if uv_faces is None and mesh.uv_faces is not None:
         uv_faces = np.asarray(mesh.uv_faces)
     uv = None if mesh.uv is None else np.asarray(mesh.uv)
@@ -265,11 +269,11 @@ def _remade(
 
 
 def _clusters(x: Float[np.ndarray, "vertices 3"], distance: float) -> Int[np.ndarray, " vertices"]:
-    """A number for each vertex, the same for those that are linked; in order of the first."""
-    # Of what coincides one is enough: pairs among many would fill the memory.
+    """Cluster of each vertex; clusters are numbered in the order of their first vertex."""
+    # Only unique positions are paired: pairs of many coincident vertices would fill the memory.
     places, which = np.unique(x, axis=0, return_inverse=True)
     tree = KDTree(places)
-    if tree.count_neighbors(tree, distance) > _MOST_PAIRS:
+    if tree.count_neighbors(tree, distance) > _MAX_PAIRS:
         raise MeshError(
             f"{len(x):,} vertices lie so close that most are within {1e3 * distance:g} mm of"
             " thousands of others. Export it in another unit, or decimate it first."
@@ -285,7 +289,7 @@ def _clusters(x: Float[np.ndarray, "vertices 3"], distance: float) -> Int[np.nda
 def _has_area(
     x: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Bool[np.ndarray, " faces"]:
-    return _areas(x, faces) > _THIN
+    return _areas(x, faces) > _MIN_AREA
 
 
 def _areas(
@@ -295,17 +299,17 @@ def _areas(
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
-def _senses(
+def _windings(
     faces: Int[np.ndarray, "faces 3"],
 ) -> tuple[Bool[np.ndarray, " faces"], Int[np.ndarray, " faces"]]:
-    """Faces to turn round so that neighbours run in one sense, the first of a part as it is.
+    """Faces to flip for a consistent winding, and the connected part of each face.
 
-    A part is what edges of two faces join; its number comes with each face.
+    Parts are connected by edges with two faces. The first face of a part isn't flipped.
     """
     edges = mesh_edges(faces)
     two = np.flatnonzero(edges.count == 2)
     pairs = edges.faces[two].astype(np.int64)
-    # Neighbours agree where they pass their common edge in opposite directions.
+    # Neighbours have the same winding if they traverse their common edge in opposite directions.
     passes = [
         (faces[pairs[:, side]] == edges.vertices[two, :1]).argmax(axis=1) for side in range(2)
     ]
@@ -315,7 +319,7 @@ def _senses(
     differ = after[0] == after[1]
     count = len(faces)
     graph = coo_matrix((np.ones(len(two), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
-    sense = np.zeros(count, dtype=bool)
+    flip = np.zeros(count, dtype=bool)
     keys = np.concatenate([pairs[:, 0] * count + pairs[:, 1], pairs[:, 1] * count + pairs[:, 0]])
     order = np.argsort(keys)
     keys, differ = keys[order], np.concatenate([differ, differ])[order]
@@ -325,5 +329,5 @@ def _senses(
         steps = walk[1:]
         turn = differ[np.searchsorted(keys, before[steps].astype(np.int64) * count + steps)]
         for face, turned in zip(steps, turn, strict=True):
-            sense[face] = sense[before[face]] ^ turned
-    return sense, parts
+            flip[face] = flip[before[face]] ^ turned
+    return flip, parts

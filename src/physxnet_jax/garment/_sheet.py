@@ -1,4 +1,4 @@
-"""Plain pieces of cloth, for experiments and tests."""
+"""Simple cloth meshes for experiments and tests."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,16 +20,16 @@ def square_sheet(
     pinned: Int[np.ndarray, " pins"] | None = None,
     fabric: Fabric = COTTON,
 ) -> Garment:
-    """A sheet of n x n vertices, level or hanging, in front of the body.
+    """A horizontal or hanging sheet of n x n vertices in front of the body.
 
     Vertex ``i * n + j`` lies in row i along z (or downwards) and column j along x.
 
     Args:
-        n: Vertices a side.
+        n: Vertices per side.
         size: Length of its sides [m], across and along.
-        corner: Where its first vertex lies [m].
-        upright: Hangs downwards from its first row instead of lying level.
-        pinned: Vertices held where they are.
+        corner: Position of its first vertex [m].
+        upright: Let it hang down from its first row instead of lying horizontally.
+        pinned: Pinned vertices, see `free_garment`.
         fabric: Material.
     """
     across, along = (size, size) if isinstance(size, (int, float)) else size
@@ -63,14 +63,14 @@ def free_garment(
     fabric: Fabric = COTTON,
     name: str = "sheet",
 ) -> Garment:
-    """Any mesh as a garment that hangs on nothing; what is pinned follows the hips.
+    """Makes a garment of any mesh, not attached to the skin; pinned vertices follow the hips.
 
     Args:
         vertices: Positions [m].
         faces: Triangles.
         pinned: Vertices that follow the hips.
         fabric: Material.
-        name: Its name.
+        name: Name of the garment.
     """
     body = load_body()
     v = np.asarray(vertices, dtype=np.float64)

@@ -37,9 +37,9 @@ _SHORT_SLEEVE = 0.5
 _SKIRT_ROW = 0.021
 _MAX_EDGE = 0.031
 _FARTHEST = 0.019
-# Clearance of a hem that was levelled [m].
+# Clearance of a levelled hem [m].
 _HEM_GAP = 0.0065
-# Height of the top over the trousers where both are [m].
+# Height of the top over the trousers where they overlap [m].
 _OVER_TROUSERS = 0.005
 ASSET = "templates_cc0.npz"
 
@@ -51,9 +51,9 @@ class _Cut:
 
 
 def build_template(name: Template, body: Body | None = None) -> Garment:
-    """Cuts a template anew from the helper tights and skirt (ten seconds).
+    """Builds a template from the helper tights and skirt, in about ten seconds.
 
-    `template` loads the same from the package.
+    `template` loads the same garment from the package.
 
     Args:
         name: ``top`` (long sleeves), ``bottom`` (trousers) or ``dress`` (short
@@ -62,10 +62,10 @@ def build_template(name: Template, body: Body | None = None) -> Garment:
 
     Returns:
         The garment on the default shape, 5 to 20 mm clear of the skin (the skirt
-        hangs free), with uv.
+        hangs free), with texture coordinates.
 
     Raises:
-        MeshError: An unknown name.
+        MeshError: The name is unknown.
     """
     body = load_body() if body is None else body
     rest = np.asarray(body.rest_vertices(body.default_shape()), dtype=np.float64)
@@ -94,9 +94,9 @@ def build_template(name: Template, body: Body | None = None) -> Garment:
     vertices = bridge_hollows(mesh, vertices, piece.faces, farthest=_FARTHEST)
     vertices = relax_crossings(mesh, vertices, piece.faces)
     if name == "top":
-        # Over the hollow behind it was drawn up.
-        vertices = _levelled(mesh, vertices, piece.faces)
-        # Both hug the skin where their hems overlap: over trousers it is worn.
+        # Spanning the hollow of the back pulled the hem up.
+        vertices = _level_top_hem(mesh, vertices, piece.faces)
+        # Both garments hug the skin where their hems overlap, and the top is the outer one.
         under = build_template("bottom", body).mesh
         vertices = lift_over(under, vertices, piece.faces, _OVER_TROUSERS)
     pinned = np.zeros(len(vertices), dtype=bool)
@@ -107,21 +107,21 @@ def build_template(name: Template, body: Body | None = None) -> Garment:
     return _assemble(name, piece, vertices, vertices - start, pinned, fabric, body)
 
 
-def _levelled(
+def _level_top_hem(
     skin: TriMesh, vertices: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "vertices 3"]:
-    """A top with a level hem, which keeps as far off the skin as the rest of it."""
+    """Levels a top's hem, within the clearance that the rest of it has."""
     level = level_hem(vertices, faces, _HEM_TOP)
-    came = np.abs(level - vertices).max(axis=1) > 1e-4
+    lowered = np.abs(level - vertices).max(axis=1) > 1e-4
     clear, _ = lift_out(skin, level, faces, _HEM_GAP, iterations=12)
-    out = np.where(came[:, None], clear, vertices)
+    out = np.where(lowered[:, None], clear, vertices)
     distance, away = clearance(skin, out)
-    return out - np.where(came, np.maximum(distance - _FARTHEST, 0.0), 0.0)[:, None] * away
+    return out - np.where(lowered, np.maximum(distance - _FARTHEST, 0.0), 0.0)[:, None] * away
 
 
 @functools.cache
 def template(name: Template) -> Garment:
-    """A template garment from the package, see `build_template`.
+    """Loads a template garment from the package, see `build_template`.
 
     Args:
         name: ``top``, ``bottom`` or ``dress``.
@@ -130,7 +130,7 @@ def template(name: Template) -> Garment:
         The garment at rest on the built-in body's default shape.
 
     Raises:
-        MeshError: Another name.
+        MeshError: The name is unknown.
 
     Example:
         >>> template("bottom").mesh.vertices.shape[1]
@@ -141,7 +141,7 @@ def template(name: Template) -> Garment:
     resource = importlib.resources.files(__name__.rpartition(".")[0]) / "assets" / ASSET
     with importlib.resources.as_file(resource) as path, np.load(path) as data:
         part = {k: data[f"{name}_{k}"] for k in _STORED}
-    # What is kept mustn't belong to the program that happens to be traced.
+    # Cached arrays must not be tracers of a surrounding transformation.
     with jax.ensure_compile_time_eval():
         return _from_arrays(name, part)
 
@@ -177,7 +177,7 @@ _STORED = (
 
 
 def stored_arrays(garment: Garment) -> dict[str, np.ndarray]:
-    """What the asset keeps of a template."""
+    """Arrays of a template that the asset stores."""
     values = {
         "vertices": garment.mesh.vertices,
         "faces": np.asarray(garment.mesh.faces).astype(np.uint16),
@@ -216,7 +216,7 @@ def _assemble(
 
 
 def _cylinder_uv(p: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 2"]:
-    """Front and back projected side by side: enough for a pattern, not for print."""
+    """Projects front and back side by side: sufficient for patterns, not for prints."""
     low, high = p.min(axis=0), p.max(axis=0)
     size = np.maximum(high - low, 1e-6)
     q = (p - low) / size
@@ -225,14 +225,14 @@ def _cylinder_uv(p: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "verti
 
 
 def _neck(p: Float[np.ndarray, "vertices 3"], slope: float) -> np.ndarray:
-    """Height of a plane that dips towards the chest."""
+    """Height relative to a plane that slopes down towards the chest [m]."""
     return p[:, 1] + slope * p[:, 2]
 
 
 def _keep(
     rows: sp.csr_matrix, faces: np.ndarray, rest: np.ndarray, field, body: Body | None = None
 ) -> _Cut:
-    """The part where the field is negative. With a body, its arms are kept as well."""
+    """Keeps the part where the field is negative, and the arms of the body if one is given."""
     p = rows @ rest
     value = field(p)
     if body is not None:
@@ -254,14 +254,14 @@ def _short_sleeves(piece: _Cut, rest: np.ndarray, body: Body) -> _Cut:
         bone = tails[j] - heads[j]
         p = piece.rows @ rest
         along = (p - heads[j]) @ bone / (bone @ bone) - _SHORT_SLEEVE
-        mine = (_arm_share(piece.rows, body) > 0.3) & (sign * p[:, 0] > 0)
-        part, tri, _ = cut(piece.rows, piece.faces, np.where(mine, along, -1.0))
+        on_arm = (_arm_share(piece.rows, body) > 0.3) & (sign * p[:, 0] > 0)
+        part, tri, _ = cut(piece.rows, piece.faces, np.where(on_arm, along, -1.0))
         piece = _Cut(part, tri)
     return piece
 
 
 def _weld_skirt(piece: _Cut, rest: np.ndarray, body: Body) -> _Cut:
-    """Continues the torso's lower border with a skirt, column for column."""
+    """Extends the torso's lower border with a skirt, one column per border vertex."""
     p = piece.rows @ rest
     loops = boundary_loops(piece.faces)
     loop = min(loops, key=lambda x: p[x, 1].mean())
@@ -275,7 +275,7 @@ def _weld_skirt(piece: _Cut, rest: np.ndarray, body: Body) -> _Cut:
     blocks: list[sp.csr_matrix] = []
     for s in range(1, steps + 1):
         height = first + (s / steps) * (_DRESS_HEM - first)
-        # Near the weld the column starts from the torso, not from the helper skirt.
+        # Near the weld, columns blend from the torso into the helper skirt.
         fade = min(1.0, s / 4.0)
         lines = []
         for k in range(len(loop)):
@@ -299,7 +299,7 @@ def _weld_skirt(piece: _Cut, rest: np.ndarray, body: Body) -> _Cut:
         a, b = table[s], np.roll(table[s], -1)
         d, e = table[s + 1], np.roll(table[s + 1], -1)
         odd = (np.arange(c) + s) % 2 == 0
-        # Boundary loops run along their faces' half edges: the skirt's go against.
+        # Boundary loops follow the half edges of their faces; skirt faces use the opposite ones.
         one = np.where(odd[:, None], np.column_stack([b, a, d]), np.column_stack([b, a, e]))
         two = np.where(odd[:, None], np.column_stack([b, d, e]), np.column_stack([a, d, e]))
         faces += [one, two]
@@ -327,15 +327,15 @@ def _skirt_rings(
 def _at_angles(
     ring: Int[np.ndarray, " ring"], angle: np.ndarray, rest: np.ndarray
 ) -> tuple[sp.csr_matrix, np.ndarray]:
-    """Points of a ring seen from its middle in given directions, as mixtures."""
+    """Points of a ring at given angles about its centre: combination rows and positions."""
     centre = rest[ring].mean(axis=0)
-    own = np.arctan2(rest[ring, 0] - centre[0], rest[ring, 2] - centre[2])
-    order = np.argsort(own)
-    ring, own = ring[order], own[order]
-    after = np.searchsorted(own, angle) % len(ring)
+    ring_angles = np.arctan2(rest[ring, 0] - centre[0], rest[ring, 2] - centre[2])
+    order = np.argsort(ring_angles)
+    ring, ring_angles = ring[order], ring_angles[order]
+    after = np.searchsorted(ring_angles, angle) % len(ring)
     before = (after - 1) % len(ring)
-    span = np.mod(own[after] - own[before], 2 * np.pi)
-    t = np.mod(angle - own[before], 2 * np.pi) / span
+    span = np.mod(ring_angles[after] - ring_angles[before], 2 * np.pi)
+    t = np.mod(angle - ring_angles[before], 2 * np.pi) / span
     lines = np.arange(len(angle))
     rows = sp.csr_matrix(
         (
@@ -348,7 +348,7 @@ def _at_angles(
 
 
 def _targets(name: Template, p: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Wanted clearance [m] and where the cloth may stand farther off."""
+    """Target clearance [m], and where the cloth may be farther from the skin."""
     free = np.zeros(len(p))
     if name == "top":
         target = np.interp(p[:, 1], [_HEM_TOP, 0.25, 0.45], [0.017, 0.014, 0.011])
@@ -357,12 +357,12 @@ def _targets(name: Template, p: np.ndarray, faces: np.ndarray) -> tuple[np.ndarr
     else:
         target = np.interp(p[:, 1], [_DRESS_HEM, 0.0, 0.3, 0.45], [0.012, 0.010, 0.009, 0.009])
         free = (p[:, 1] < _DRESS_WAIST).astype(float)
-    room = _room(p, faces)
-    return np.minimum(target, np.maximum(0.3 * room, 0.0065)), free
+    free_distance = _free_distance(p, faces)
+    return np.minimum(target, np.maximum(0.3 * free_distance, 0.0065)), free
 
 
-def _room(p: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """Distance to the garment itself along the outward normal [m]."""
+def _free_distance(p: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Distance to the garment itself along its outward normals [m]."""
     mesh: TriMesh = make_mesh(p, faces)
     normals = vertex_normals(mesh.vertices, mesh.faces)
     hits = cast_rays(mesh, mesh.vertices + 0.002 * normals, normals, max_distance=0.2)

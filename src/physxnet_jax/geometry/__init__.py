@@ -1,19 +1,23 @@
-"""Meshes and what can be asked of them. Knows nothing of bodies or garments."""
+"""Triangle meshes and geometric queries, independent of bodies and garments."""
 
 from ._barycentric import interpolate as interpolate
 from ._candidates import nearby_faces as nearby_faces, spread_points as spread_points
 from ._closest import (
-    ClosestPoints as ClosestPoints,
     closest_among as closest_among,
     closest_barycentric as closest_barycentric,
     closest_points as closest_points,
-    least_index as least_index,
+    fast_argmin as fast_argmin,
     signed_distance as signed_distance,
 )
-from ._frames import each_frame as each_frame
+from ._edge_constraints import (
+    EdgeConstraints as EdgeConstraints,
+    limit_strain as limit_strain,
+    make_edge_constraints as make_edge_constraints,
+)
+from ._frames import map_frames as map_frames
 from ._intersect import self_intersections as self_intersections
 from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
-from ._normals import face_normals as face_normals, vertex_normals as vertex_normals
+from ._normals import vertex_normals as vertex_normals
 from ._padding import padded_rows as padded_rows
 from ._polygons import (
     Material as Material,
@@ -23,7 +27,7 @@ from ._polygons import (
     make_material as make_material,
     make_texture as make_texture,
 )
-from ._raycast import RayHits as RayHits, cast_rays as cast_rays
+from ._raycast import cast_rays as cast_rays
 from ._rotation import (
     matrix_from_quaternion as matrix_from_quaternion,
     polar_rotation as polar_rotation,
@@ -32,8 +36,8 @@ from ._rotation import (
     quaternion_multiply as quaternion_multiply,
     safe_norm as safe_norm,
     safe_normalize as safe_normalize,
+    slerp as slerp,
 )
-from ._springs import Springs as Springs, make_springs as make_springs, relax as relax
 from ._stencil import (
     Smoothing as Smoothing,
     Stencil as Stencil,
@@ -41,10 +45,9 @@ from ._stencil import (
     gaussian_stencil as gaussian_stencil,
 )
 from ._topology import (
-    Edges as Edges,
     boundary_loops as boundary_loops,
     connected_components as connected_components,
-    greedy_colours as greedy_colours,
+    greedy_coloring as greedy_coloring,
     hinges as hinges,
     manifold_report as manifold_report,
     mesh_edges as mesh_edges,

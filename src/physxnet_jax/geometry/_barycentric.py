@@ -1,4 +1,4 @@
-"""Barycentric interpolation and the sparse row-stochastic matrix built on it."""
+"""Barycentric interpolation."""
 
 import jax
 import jax.numpy as jnp

@@ -16,14 +16,14 @@ def nearby_faces(
 ) -> Int[np.ndarray, "points k"]:
     """Faces around the mesh vertices nearest to each point.
 
-    Enough for `closest_among` on meshes without long thin triangles: the closest
+    They suffice for `closest_among` on meshes without long thin triangles: the closest
     face nearly always touches one of the nearest vertices.
 
     Args:
         vertices: Mesh vertices [m].
         faces: Mesh faces.
         points: Query points [m].
-        neighbours: Nearest vertices whose faces are taken.
+        neighbours: Number of nearest vertices whose faces are taken.
 
     Returns:
         Face indices, with repetitions where a vertex has few faces.
@@ -38,9 +38,9 @@ def nearby_faces(
 def spread_points(
     points: Float[np.ndarray, "points 3"], spacing: float
 ) -> Int[np.ndarray, " chosen"]:
-    """A subset of points at least ``spacing`` [m] apart, greedily in order.
+    """Indices of points at least ``spacing`` [m] apart, chosen greedily in order.
 
-    Every point left out has a chosen one within ``spacing``.
+    Every other point has a chosen one within ``spacing``.
     """
     tree = KDTree(points)
     free = np.ones(len(points), dtype=bool)

@@ -14,9 +14,9 @@ from ._rotation import safe_normalize
 from ._topology import mesh_edges
 
 _FACE_CHUNK = 256
-# Squares of lengths and of areas below this have no finite inverse square in float32, which
-# derivatives of quotients take; so short an edge is a point, so thin a triangle a line.
-_LEAST = 1e-18
+# Derivatives of a quotient contain the inverse square of its denominator, which overflows
+# float32 below this value. Edges so short count as points, triangles so thin as lines.
+_MIN_SQUARE = 1e-18
 
 
 @pytree
@@ -44,7 +44,7 @@ def closest_barycentric(
     """Barycentric coordinates of the point of triangle abc closest to p.
 
     The component axis comes first, so that the work is element-wise over the rest.
-    Finite, with finite gradient, for triangles degenerated to a line or to a point.
+    Values and gradients are finite for triangles degenerated to a line or a point.
 
     Args:
         p: Query points [m].
@@ -63,10 +63,10 @@ def closest_barycentric(
     zero, one = jnp.zeros_like(ap[0]), jnp.ones_like(ap[0])
 
     def ratio(num: Array, den: Array) -> Array:
-        ok = den > _LEAST
+        ok = den > _MIN_SQUARE
         return jnp.where(ok, num / jnp.where(ok, den, one), zero)
 
-    # The nearest of the three edges, each by itself: right for any degeneracy.
+    # Nearest of the three edges, computed separately: correct for any degeneracy.
     t = jnp.clip(ratio(_dot(ab, ap), _dot(ab, ab)), 0.0, 1.0)
     gap = ap - t[None] * ab
     v, w, best = t, zero, _dot(gap, gap)
@@ -78,14 +78,14 @@ def closest_barycentric(
         v = jnp.where(near, 1 - t if is_bc else zero, v)
         w = jnp.where(near, t, w)
         best = jnp.where(near, squared, best)
-    # The interior, where the foot of the perpendicular lies in it.
+    # Interior of the triangle, if the projection of p lies in it.
     d00, d01, d11 = _dot(ab, ab), _dot(ab, ac), _dot(ac, ac)
     d20, d21 = _dot(ap, ab), _dot(ap, ac)
     det = d00 * d11 - d01 * d01
     v_in, w_in = ratio(d11 * d20 - d01 * d21, det), ratio(d00 * d21 - d01 * d20, det)
     gap = ap - v_in[None] * ab - w_in[None] * ac
     squared = _dot(gap, gap)
-    inside = (det > _LEAST) & (v_in > 0) & (w_in > 0) & (v_in + w_in < 1) & (squared <= best)
+    inside = (det > _MIN_SQUARE) & (v_in > 0) & (w_in > 0) & (v_in + w_in < 1) & (squared <= best)
     v, w = jnp.where(inside, v_in, v), jnp.where(inside, w_in, w)
     return jnp.stack([1 - v - w, v, w]), jnp.where(inside, squared, best)
 
@@ -96,18 +96,18 @@ def _dot(x: Array, y: Array) -> Array:
 
 @jax.jit
 def closest_points(mesh: TriMesh, points: Float[Array, "points 3"]) -> ClosestPoints:
-    """Exact closest points by comparing with every face, a chunk of faces at a time.
+    """Finds exact closest points by comparison with every face, in chunks of faces.
 
     Memory is bounded by points x 256 faces. Time is points x faces: for repeated
-    queries near a known place use candidates (`closest_among`).
+    queries near a known position use candidates (`closest_among`).
 
     Args:
         mesh: The mesh.
         points: Query points [m].
 
     Returns:
-        Closest faces, barycentric weights and squared distances. Of equally near
-        faces the first is taken.
+        Closest faces, barycentric weights and squared distances. Ties go to the
+        first face.
     """
     faces = mesh.faces
     n = faces.shape[0]
@@ -146,7 +146,7 @@ def closest_among(
     points: Float[Array, "points 3"],
     candidates: Int[Array, "points k"],
 ) -> ClosestPoints:
-    """Closest points among a short list of faces for each point.
+    """Finds closest points among a short list of faces for each point.
 
     Args:
         mesh: The mesh.
@@ -158,7 +158,7 @@ def closest_among(
     """
     corners = mesh.vertices[mesh.faces].reshape(-1, 9)
     p = points.T
-    # Only the triangle taken is differentiated: the others would fill the memory of a gradient.
+    # Only the chosen triangle is differentiated: a gradient through all takes too much memory.
     face = _nearest(jax.lax.stop_gradient(corners), jax.lax.stop_gradient(p), candidates)
     a, b, c = corners[face].T.reshape(3, 3, -1)
     weights, squared = closest_barycentric(p, a, b, c)
@@ -170,27 +170,27 @@ def _nearest(
     p: Float[Array, "3 points"],
     candidates: Int[Array, "points k"],
 ) -> Int[Array, " points"]:
-    """The nearest of each point's candidates, the first of equally near ones."""
-    # Number by number, points last: CPUs then compute in vectors, if the copies are made before.
+    """The nearest of each point's candidates; ties go to the first."""
+    # One array per coordinate, points last: CPUs vectorise this if the copies are made first.
     order = candidates.T
     copies = jax.lax.optimization_barrier(jnp.stack([c[order] for c in corners.T]))
     a, b, c = copies.reshape(3, 3, *order.shape)
     _, squared = closest_barycentric(jnp.broadcast_to(p[:, None], a.shape), a, b, c)
-    near = least_index(squared, axis=0)
+    near = fast_argmin(squared, axis=0)
     return candidates[jnp.arange(near.shape[0]), near].astype(jnp.int32)
 
 
-def least_index(values: Float[Array, "rows columns"], *, axis: int = 1) -> Int[Array, " others"]:
-    """Where the least value along an axis is, the first of equal ones.
+def fast_argmin(values: Float[Array, "rows columns"], *, axis: int = 1) -> Int[Array, " others"]:
+    """Index of the smallest value along an axis; ties go to the first.
 
-    `jnp.argmin` that CPUs run in vectors: ten times faster on wide rows. Where there is a NaN
-    the last index is given.
+    Unlike `jnp.argmin` it is vectorised on CPUs: ten times faster on wide rows. Where there
+    is a NaN, the result is the last index.
     """
     index = jax.lax.broadcasted_iota(jnp.int32, values.shape, axis)
-    # Computed once: rounded anew beside its minimum a value would be equal to none.
+    # Without the barrier, recomputed values could round differently and equal no minimum.
     values = jax.lax.optimization_barrier(values)
-    least = jnp.min(values, axis=axis, keepdims=True)
-    return jnp.min(jnp.where(values <= least, index, values.shape[axis] - 1), axis=axis)
+    smallest = jnp.min(values, axis=axis, keepdims=True)
+    return jnp.min(jnp.where(values <= smallest, index, values.shape[axis] - 1), axis=axis)
 
 
 def signed_distance(
@@ -202,12 +202,12 @@ def signed_distance(
     """Distance to a closed mesh [m], negative inside.
 
     The sign comes from the pseudonormal of the closest feature (face, edge or
-    vertex), which is right everywhere on a closed, consistently oriented mesh.
+    vertex), which is correct everywhere on a closed, consistently oriented mesh.
 
     Args:
         mesh: A closed mesh, faces outwards.
         points: Query points [m].
-        closest: Known closest points; exact ones are found if omitted.
+        closest: Known closest points; exact ones are computed if omitted.
 
     Returns:
         Signed distances.
@@ -236,7 +236,7 @@ def _signed(
     on: Bool[Array, "points 3"] = hit.weights <= tiny
     count = jnp.sum(on.astype(jnp.int32), axis=1)
     corner = jnp.argmax(hit.weights, axis=1)
-    gone = jnp.argmin(hit.weights, axis=1)
+    opposite_corner = jnp.argmin(hit.weights, axis=1)
     lane = jnp.arange(points.shape[0])
     tri = mesh.faces[hit.face]
     normal = jnp.where(
@@ -244,7 +244,7 @@ def _signed(
         corner_normals[tri[lane, corner]],
         jnp.where(
             (count == 1)[:, None],
-            edge_normals[of_face[hit.face, gone]],
+            edge_normals[of_face[hit.face, opposite_corner]],
             normals[hit.face],
         ),
     )

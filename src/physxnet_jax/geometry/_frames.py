@@ -1,4 +1,4 @@
-"""Frames one after the other, or all at once: whatever the device does best."""
+"""Mapping over frames, sequentially or vectorised depending on the device."""
 
 from collections.abc import Callable
 from typing import TypeVar
@@ -9,15 +9,15 @@ from jaxtyping import Array, Shaped
 _Result = TypeVar("_Result")
 
 
-def each_frame(function: Callable[..., _Result], *frames: Shaped[Array, "frames ..."]) -> _Result:
-    """A function of one frame applied to each, differentiable.
+def map_frames(function: Callable[..., _Result], *frames: Shaped[Array, "frames ..."]) -> _Result:
+    """Applies a function of one frame to every frame; differentiable.
 
-    CPUs take one frame after the other: what lies between fits their caches. A gradient
-    computes that anew instead of keeping it.
+    CPUs process one frame after another, so that intermediates fit their caches. Gradients
+    recompute intermediates instead of storing them.
 
     Args:
-        function: Of one frame of each array.
-        frames: Arrays of frames.
+        function: Function of one frame of each array.
+        frames: Arrays with a leading frame axis.
     """
     one = jax.checkpoint(function)
     return jax.lax.platform_dependent(

@@ -12,8 +12,8 @@ def self_intersections(
 ) -> Int[np.ndarray, "pairs 2"]:
     """Pairs (edge, face) of a mesh that cross in their interiors.
 
-    Pairs that share a vertex are left out. Candidates come from bounding spheres, so
-    nothing that crosses is missed; the test itself is in float64.
+    Pairs that share a vertex are excluded. Candidates come from bounding spheres, so no
+    crossing is missed. The test itself runs in float64.
 
     Args:
         vertices: Positions [m].

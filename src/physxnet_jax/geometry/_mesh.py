@@ -40,14 +40,14 @@ def make_mesh(
     *,
     name: str = "mesh",
 ) -> TriMesh:
-    """A `TriMesh` from host arrays, checked.
+    """Builds a `TriMesh` from host arrays after checking them.
 
     Args:
         vertices: Positions [m], shape [vertices, 3].
         faces: Vertex indices, shape [faces, 3].
         uv: Texture coordinates, shape [uvs, 2].
-        uv_faces: Corner indices into ``uv``; ``faces`` if ``uv`` has one row a vertex.
-        name: What to call the mesh in an error.
+        uv_faces: Corner indices into ``uv``; ``faces`` by default (one uv row per vertex).
+        name: Name of the mesh in errors.
 
     Returns:
         The mesh, float32 and int32.
@@ -62,7 +62,7 @@ def make_mesh(
     """
     v = np.asarray(vertices, dtype=np.float32)
     if not np.array_equal(np.asarray(faces, dtype=np.float64), np.asarray(faces, dtype=np.int64)):
-        raise MeshError(f"{name}: faces name fractions of vertices; they are whole numbers.")
+        raise MeshError(f"{name}: face indices contain fractions, expected whole numbers.")
     f = np.asarray(faces, dtype=np.int64)
     if v.ndim != 2 or v.shape[1] != 3:
         raise MeshError(f"{name}: vertices have shape {v.shape}, expected [vertices, 3].")
@@ -73,7 +73,7 @@ def make_mesh(
         )
     if f.min() < 0 or f.max() >= len(v):
         raise MeshError(
-            f"{name}: a face names vertex {f.min() if f.min() < 0 else f.max()}, but"
+            f"{name}: a face refers to vertex {f.min() if f.min() < 0 else f.max()}, but"
             f" there are {len(v)} vertices (0 to {len(v) - 1})."
         )
     if not np.isfinite(v).all():
@@ -90,7 +90,7 @@ def make_mesh(
         )
     if tf.min() < 0 or tf.max() >= len(t):
         raise MeshError(
-            f"{name}: a corner names uv {tf.min() if tf.min() < 0 else tf.max()}, but there are"
+            f"{name}: a corner refers to uv {tf.min() if tf.min() < 0 else tf.max()}, but there are"
             f" {len(t)} (0 to {len(t) - 1})."
         )
     if not np.isfinite(t).all():

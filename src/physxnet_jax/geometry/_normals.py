@@ -29,8 +29,8 @@ def vertex_normals(
 ) -> Float[Array, "*batch vertices 3"]:
     """Angle-weighted unit normals of vertices.
 
-    With these the sign of the distance to a closed mesh is right also where the
-    closest feature is a vertex.
+    They give the correct sign of the distance to a closed mesh where the closest feature
+    is a vertex.
 
     Args:
         vertices: Positions [m].

@@ -1,4 +1,4 @@
-"""Numbers of rows that programs share."""
+"""Padding of arrays, so that meshes of similar size share compiled programs."""
 
 import numpy as np
 from jaxtyping import Shaped
@@ -7,10 +7,10 @@ _MULTIPLE = 1024
 
 
 def padded_rows(values: Shaped[np.ndarray, "rows ..."]) -> Shaped[np.ndarray, "padded ..."]:
-    """An array with its last row repeated up to a multiple of 1024 rows.
+    """Repeats the last row of an array up to a multiple of 1024 rows.
 
-    Programs are compiled for numbers of rows: meshes of about the same size then share
-    one. No rows stay none.
+    Programs are compiled for a number of rows; meshes of about the same size then share
+    one. Empty arrays stay empty.
 
     Args:
         values: Any array, shape [rows, ...].

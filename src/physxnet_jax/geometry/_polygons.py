@@ -1,4 +1,4 @@
-"""Faces as a file has them, before they were cut into triangles: for writing them again."""
+"""Polygons and materials of a mesh file before triangulation, kept for export."""
 
 import dataclasses
 import functools
@@ -16,8 +16,8 @@ class Texture:
     """An image that colours faces by their texture coordinates.
 
     Attributes:
-        name: What its file is called, without folders.
-        data: The file as it is, a PNG or a JPEG; None if it wasn't there or is neither.
+        name: File name, without folders.
+        data: Contents of the file, a PNG or a JPEG; None if it was missing or is neither.
     """
 
     name: str
@@ -25,16 +25,16 @@ class Texture:
 
     @property
     def ending(self) -> str:
-        """What its kind of file ends in: ``.png`` or ``.jpg``."""
+        """File extension of the format: ``.png`` or ``.jpg``."""
         return ".png" if self.data is None else _kind(self.data) or ".png"
 
 
 def make_texture(name: str, data: bytes | None) -> Texture:
-    """A texture as a file tells it; what is neither PNG nor JPEG is only named.
+    """Builds a texture; data that is neither PNG nor JPEG is dropped.
 
     Args:
-        name: What its file is called; folders are left out.
-        data: The file; None if it can't be had.
+        name: File name; folders are removed.
+        data: Contents of the file; None if it isn't available.
     """
     name = name.replace("\\", "/").rpartition("/")[2]
     return Texture(name, data if data is not None and _kind(data) else None)
@@ -48,13 +48,12 @@ def _kind(data: bytes) -> str | None:
 
 @dataclasses.dataclass(frozen=True)
 class Material:
-    """What a file calls the look of some faces.
+    """A material in a mesh file.
 
     Attributes:
-        name: Its name there.
-        colour: Linear RGB in [0, 1], by which a texture is multiplied; None if the file
-            doesn't say.
-        texture: Its base colour as an image; None without one.
+        name: Name in the file.
+        colour: Linear RGB in [0, 1], multiplied with the texture; None if the file has none.
+        texture: Base colour image; None without one.
     """
 
     name: str
@@ -63,12 +62,12 @@ class Material:
 
 
 def make_material(name: str, colour: object = None, texture: Texture | None = None) -> Material:
-    """A material as a file tells it; a colour that isn't three finite numbers is none.
+    """Builds a material; a colour that isn't three finite numbers becomes None.
 
     Args:
-        name: Its name.
-        colour: Linear RGB, brought into [0, 1].
-        texture: Its image.
+        name: Name of the material.
+        colour: Linear RGB, clipped to [0, 1].
+        texture: Base colour image.
     """
     rgb = np.zeros(0) if colour is None else np.asarray(colour)
     if rgb.shape != (3,) or rgb.dtype.kind not in "fiu" or not np.isfinite(rgb).all():
@@ -81,14 +80,14 @@ def make_material(name: str, colour: object = None, texture: Texture | None = No
 class Polygons:
     """Polygons over the vertices of a mesh, and their materials.
 
-    Triangles are cut from them in order, two fewer than a polygon has corners. Equal
-    contents are equal and have one hash, so that it may be static in a traced function.
+    A polygon with n corners has n - 2 triangles, in the order of the polygons. Equality and
+    hash depend on contents, so instances can be static arguments of traced functions.
 
     Attributes:
-        counts: Corners of each polygon, shape [polygons].
-        corners: Vertices, polygon after polygon, shape [corners].
-        uv_corners: Rows of texture coordinates, shape [corners]; or None.
-        material: Which of ``materials`` each has, -1 for none, shape [polygons].
+        counts: Number of corners of each polygon, shape [polygons].
+        corners: Vertex indices, polygon after polygon, shape [corners].
+        uv_corners: Indices of texture coordinates, shape [corners]; or None.
+        material: Index into ``materials``, -1 for none, shape [polygons].
         materials: Materials.
     """
 
@@ -100,22 +99,22 @@ class Polygons:
 
     @functools.cached_property
     def of_triangle(self) -> Int[np.ndarray, " faces"]:
-        """The polygon that each triangle was cut from."""
+        """The polygon that each triangle belongs to."""
         return np.repeat(np.arange(len(self.counts)), self.counts - 2)
 
     @functools.cached_property
     def starts(self) -> Int[np.ndarray, " polygons"]:
-        """Where the corners of each polygon begin."""
+        """Position of the first corner of each polygon in ``corners``."""
         return np.cumsum(self.counts) - self.counts
 
     def at(self, vertices: Int[np.ndarray, " vertices"]) -> "Polygons | None":
-        """The same polygons over other rows of vertices.
+        """The same polygons with renumbered vertices.
 
         Args:
-            vertices: The new row of each vertex.
+            vertices: The new index of each vertex.
 
         Returns:
-            None if corners of a polygon fall together: then triangles are all there is.
+            The polygons; None if corners of a polygon coincide, so that only triangles remain.
         """
         moved = dataclasses.replace(self, corners=vertices[self.corners].astype(np.int32))
         rows = np.repeat(np.arange(len(moved.counts)), moved.counts)
@@ -123,7 +122,7 @@ class Polygons:
         return moved if len(pairs) == len(moved.corners) else None
 
     def chosen(self, polygons: Sequence[int] | Int[np.ndarray, " chosen"]) -> "Polygons":
-        """Some of the polygons, in the order given."""
+        """A selection of the polygons, in the given order."""
         rows = np.asarray(polygons, np.int64)
         slots = np.concatenate(
             [np.arange(a, a + n) for a, n in zip(self.starts[rows], self.counts[rows])]
@@ -138,7 +137,7 @@ class Polygons:
         )
 
     def reversed(self, polygons: Sequence[int] | Int[np.ndarray, " turned"]) -> "Polygons":
-        """Some of the polygons turned round, each from the corner that it begins with."""
+        """Reverses the winding of some polygons; each keeps its first corner."""
         slots = np.arange(len(self.corners))
         for p in np.asarray(polygons, np.int64):
             a, n = self.starts[p], self.counts[p]
@@ -167,14 +166,14 @@ class Polygons:
 
 
 def joined_polygons(parts: Sequence[tuple[Polygons, int, int]]) -> Polygons:
-    """Polygons of several meshes as those of one.
+    """Joins the polygons of several meshes.
 
     Args:
-        parts: Of each mesh its polygons, how many vertices it has, and how many rows of
-            texture coordinates.
+        parts: For each mesh its polygons, its number of vertices and its number of texture
+            coordinates.
 
     Raises:
-        MeshError: Nothing to join.
+        MeshError: There is nothing to join.
     """
     if not parts:
         raise MeshError("no polygons to join: give at least one mesh.")
@@ -187,7 +186,7 @@ def joined_polygons(parts: Sequence[tuple[Polygons, int, int]]) -> Polygons:
         corners.append(p.corners + first)
         if p.uv_corners is not None:
             uv_corners.append(p.uv_corners + row)
-        # The last is what -1 finds.
+        # The last entry maps -1 to itself.
         material.append(np.asarray([*(number[m] for m in p.materials), -1])[p.material])
         first, row = first + vertices, row + uvs
     textured = len(uv_corners) == len(parts)

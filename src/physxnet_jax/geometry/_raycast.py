@@ -48,14 +48,14 @@ def cast_rays(
     Watertight: the sign of every edge function is computed once for each edge and
     shared by the faces beside it, so a ray can't slip between two triangles, through
     an edge or through a vertex, whatever the rounding. Triangles seen edge-on count
-    as missed; their neighbours catch the ray. Zero directions hit nothing.
+    as missed; the ray hits their neighbours. Zero directions hit nothing.
 
     Args:
-        mesh: What to hit. Degenerate triangles are never hit.
+        mesh: The mesh to intersect. Degenerate triangles are never hit.
         origins: Ray origins [m].
         directions: Ray directions, any length; they are normalised.
-        both: Also look backwards and take the nearer hit; its distance is negative.
-        max_distance: Hits farther than this don't count [m].
+        both: Also cast backwards and take the nearer hit; backward distances are negative.
+        max_distance: Maximum distance of a hit [m].
 
     Returns:
         The nearest hits.
@@ -135,7 +135,7 @@ def _cast_chunk(
     max_distance: Array,
     both: bool,
 ) -> RayHits:
-    """Hits of a block of rays; the ray axis is minor, so gathers move whole rows."""
+    """Hits of a chunk of rays; the ray axis is last, so gathers move whole rows."""
     dtype = vertices.dtype
     length = safe_norm(directions)
     usable = length > 0
@@ -150,8 +150,8 @@ def _cast_chunk(
     relative = [vertices[:, c, None] - origins[None, :, c] for c in range(3)]
 
     def axis(k: int) -> Array:
-        # A permutation by selection: exact, unlike a product with 0 and 1 summed in
-        # floating point would be for infinities.
+        # A permutation by selection is exact; a sum of products with 0 and 1 isn't for
+        # infinities.
         one = onehot[k][:, None, :] > 0
         return jnp.where(one[0], relative[0], jnp.where(one[1], relative[1], relative[2]))
 

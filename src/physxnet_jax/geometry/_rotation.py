@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 # Below this squared angle [rad^2] the series replaces sin(x)/x: the error is under 1e-9.
@@ -13,8 +14,8 @@ def safe_normalize(
 ) -> Float[Array, "*batch n"]:
     """Unit vectors along the last axis; the zero vector stays zero.
 
-    Value and gradient are finite everywhere: what is no longer than ``eps`` becomes zero,
-    and so does its gradient.
+    Value and gradient are finite everywhere: vectors no longer than ``eps`` become zero,
+    and so do their gradients.
 
     Args:
         vectors: Any vectors.
@@ -30,7 +31,7 @@ def safe_normalize(
 
 
 def safe_norm(vectors: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:
-    """Length along the last axis with gradient zero at the zero vector."""
+    """Length along the last axis; its gradient is zero at the zero vector."""
     squared = jnp.sum(vectors * vectors, axis=-1)
     zero = squared <= 0.0
     return jnp.where(
@@ -91,10 +92,11 @@ def polar_rotation(
 ) -> Float[Array, "*batch 3 3"]:
     """Nearest rotation of blended rotation matrices, by Newton-Schulz iteration.
 
-    Converges where every singular value lies in (0, sqrt(3)), to a rotation if the
-    determinant is positive: true for blends of two rotations, except opposite ones, which stay
-    singular and finite (no division, no square root: no NaN in value or gradient). Of
-    three that are far apart the determinant may be negative; the result is a reflection then.
+    Converges if every singular value lies in (0, sqrt(3)), to a rotation if the determinant
+    is positive. Both hold for blends of two rotations, except opposite ones. Those stay
+    singular and finite: without division and square root, value and gradient have no NaN.
+    Blends of three rotations far apart may have a negative determinant; the result is then
+    a reflection.
 
     Args:
         matrices: Convex combinations of rotation matrices.
@@ -113,3 +115,25 @@ def polar_rotation(
             "...ij,...jk->...ik", x, gram, precision=jax.lax.Precision.HIGHEST
         )
     return x
+
+
+def slerp(
+    a: Float[np.ndarray, "*batch 4"],
+    b: Float[np.ndarray, "*batch 4"],
+    t: Float[np.ndarray, "*#batch 1"],
+) -> Float[np.ndarray, "*batch 4"]:
+    """Spherical interpolation of unit quaternions along the shorter arc.
+
+    Nearly equal quaternions are interpolated linearly and normalised. This runs on the
+    host, as every clip length would need its own compilation.
+    """
+    dot = np.sum(a * b, axis=-1, keepdims=True)
+    b = np.where(dot < 0, -b, b)
+    dot = np.minimum(np.abs(dot), 1.0)
+    near = dot > 0.9995
+    theta = np.arccos(np.where(near, 0.0, dot))
+    sine = np.sin(theta)
+    wa = np.where(near, 1.0 - t, np.sin((1.0 - t) * theta) / sine)
+    wb = np.where(near, t, np.sin(t * theta) / sine)
+    q = wa * a + wb * b
+    return q / np.linalg.norm(q, axis=-1, keepdims=True)

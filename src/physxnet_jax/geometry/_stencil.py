@@ -11,10 +11,10 @@ from scipy.sparse.csgraph import dijkstra
 from ..typing import pytree
 from ._topology import mesh_edges
 
-# Rows of shortest distances held at once.
+# Rows of the distance matrix computed at once.
 _CHUNK = 512
-# A mean over more rows than a stencil takes is followed by finer ones, at most so many.
-_FINER = 3
+# Maximum number of finer stencils after one with more rows in reach than it takes.
+_MAX_FINER_STENCILS = 3
 
 
 @pytree
@@ -32,7 +32,7 @@ class Stencil:
 
     def __matmul__(self, values: Float[Array, "*batch rows channels"]) -> Array:
         """The means, of the same shape as the values."""
-        # Whole rows of a batch are gathered at once: far fewer, longer copies.
+        # Gathering whole rows of a batch at once takes far fewer, longer copies.
         rows = jnp.moveaxis(values, -2, 0)
         wide = rows.reshape(rows.shape[0], -1)
         out = jnp.zeros_like(wide)
@@ -53,16 +53,16 @@ def gaussian_stencil(
     Args:
         vertices: Positions [m].
         faces: Triangles.
-        radius: Standard deviation [m]; vertices up to 2.2 of it away take part.
-        size: Vertices taken. Where more lie within reach, every so many are picked in
-            the order of distance; applying the stencil twice evens that out.
+        radius: Standard deviation [m]; vertices within 2.2 radii contribute.
+        size: Number of vertices. If more are within reach, they are sampled evenly in
+            order of distance; applying the stencil twice compensates for that.
 
     Returns:
         The stencil; unconnected vertices keep their own value.
     """
     count = len(vertices)
     edges = mesh_edges(faces).vertices
-    # An edge of length zero would read as none.
+    # The sparse graph treats an edge of length zero as absent.
     length = np.maximum(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 1e-9)
     graph = sp.csr_matrix((length, (edges[:, 0], edges[:, 1])), (count, count))
     index = np.repeat(np.arange(count, dtype=np.int32)[:, None], size, axis=1)
@@ -84,10 +84,10 @@ def gaussian_stencil(
 @pytree
 @dataclasses.dataclass(frozen=True)
 class Smoothing:
-    """Means that are taken one after the other.
+    """A sequence of weighted means.
 
     Attributes:
-        stencils: The means, in the order in which values pass them.
+        stencils: The means, in order of application.
     """
 
     stencils: tuple[Stencil, ...]
@@ -104,10 +104,11 @@ def gaussian_smoothing(
     faces: Int[np.ndarray, "faces 3"],
     radius: float,
 ) -> Smoothing:
-    """Smoothing over a mesh that leaves no lumps, however fine the mesh is.
+    """Gaussian smoothing over a mesh that leaves no lumps at any mesh resolution.
 
-    A stencil takes a few rows only. Where more lie within reach, neighbours pick different
-    ones and their means differ; means of half the radius follow until most find all of theirs.
+    A stencil takes only a few rows. If more are within reach, neighbours sample different
+    ones and their means differ. Stencils of half the radius follow until most vertices
+    average all rows within reach.
 
     Args:
         vertices: Positions [m].
@@ -115,17 +116,17 @@ def gaussian_smoothing(
         radius: Standard deviation of the widest mean [m].
 
     Returns:
-        The smoothing; constants pass it unchanged.
+        The smoothing, which preserves constants.
 
     References:
         Burt, Fast Filter Transforms for Image Processing (1981): wide kernels from
         sparse ones of several sizes.
     """
     stencils = []
-    for _ in range(_FINER + 1):
+    for _ in range(_MAX_FINER_STENCILS + 1):
         stencil = gaussian_stencil(vertices, faces, radius)
         crowded = np.mean(np.asarray(stencil.weight[:, -1]) > 0) > 0.5
-        # Twice, so that the finer mean finds rows of both picks.
+        # Applied twice, which evens out the sampling (see `gaussian_stencil`).
         stencils += [stencil, stencil] if crowded and not stencils else [stencil]
         if not crowded:
             break

@@ -25,8 +25,8 @@ class Edges:
 
 
 def mesh_edges(faces: Int[np.ndarray, "faces 3"]) -> Edges:
-    """The unique edges of a mesh and what lies beside them; not to be written to."""
-    find = _known_edges if len(faces) <= _REMEMBERED else _mesh_edges
+    """Unique edges of a mesh and their adjacent faces; the arrays are read-only."""
+    find = _cached_edges if len(faces) <= _MAX_CACHED_FACES else _mesh_edges
     return find(np.asarray(faces, dtype=np.int64).tobytes())
 
 
@@ -35,7 +35,7 @@ def _mesh_edges(faces: bytes) -> Edges:
     # Column k holds the edge opposite to corner k.
     halves = np.stack([f[:, [1, 2]], f[:, [2, 0]], f[:, [0, 1]]], axis=1)
     flat = np.sort(halves.reshape(-1, 2), axis=1)
-    # One number an edge: sorted many times as fast as pairs.
+    # One number per edge sorts many times as fast as pairs.
     size = int(f.max(initial=0)) + 1
     code, inverse = np.unique(flat[:, 0] * size + flat[:, 1], return_inverse=True)
     unique = np.stack([code // size, code % size], axis=1)
@@ -53,16 +53,16 @@ def _mesh_edges(faces: bytes) -> Edges:
     return Edges(*found)
 
 
-# The same few meshes are asked about again and again; large ones would fill the memory.
-_REMEMBERED = 200_000
-_known_edges = functools.lru_cache(maxsize=8)(_mesh_edges)
+# The same few meshes are queried repeatedly; caching large ones would fill the memory.
+_MAX_CACHED_FACES = 200_000
+_cached_edges = functools.lru_cache(maxsize=8)(_mesh_edges)
 
 
 def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " n"]]:
     """Closed chains of boundary vertices, longest first.
 
     Each loop runs in the direction of its faces' half edges. A boundary that
-    touches itself in a vertex comes out as one loop that passes it twice.
+    touches itself in a vertex is one loop that passes the vertex twice.
     """
     f = np.asarray(faces, dtype=np.int64)
     edges = mesh_edges(f)
@@ -78,7 +78,7 @@ def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " 
         loop = _chain(next(iter(following)), following)
         k = 0
         while k < len(loop):
-            # What else begins and ends here is gone round on the way.
+            # Other chains that begin and end at this vertex are inserted.
             if loop[k] in following:
                 loop[k : k + 1] = [*_chain(loop[k], following), loop[k]]
             else:
@@ -88,7 +88,7 @@ def boundary_loops(faces: Int[np.ndarray, "faces 3"]) -> list[Int[np.ndarray, " 
 
 
 def _chain(start: int, following: dict[int, list[int]]) -> list[int]:
-    """From vertex to vertex until it is closed; edges that it takes are taken out."""
+    """Follows edges until the chain closes; removes them from ``following``."""
     chain, at = [start], start
     while nexts := following.get(at):
         step = nexts.pop()
@@ -143,7 +143,7 @@ def hinges(
 ) -> Int[np.ndarray, "hinges 4"]:
     """Interior edges with the two vertices opposite to them: (a, b, one, other).
 
-    In the order of their faces, not by which lies to the left.
+    The opposite vertices follow the order of the faces, not the side they lie on.
     """
     f = np.asarray(faces)
     edges = mesh_edges(f)
@@ -157,7 +157,7 @@ def hinges(
     return np.column_stack([ends, *opposite]).astype(np.int32)
 
 
-def greedy_colours(
+def greedy_coloring(
     elements: Int[np.ndarray, "elements n"], num_vertices: int
 ) -> list[Int[np.ndarray, " members"]]:
     """Groups of elements that share no vertex within a group.
@@ -182,12 +182,12 @@ def greedy_colours(
 def manifold_report(
     faces: Int[np.ndarray, "faces 3"],
 ) -> dict[str, int]:
-    """Counts of what usually goes wrong: non-manifold edges, duplicates, flips."""
+    """Counts common defects: non-manifold edges, duplicate faces, inconsistent winding."""
     f = np.asarray(faces, dtype=np.int64)
     edges = mesh_edges(f)
     rows = np.sort(f, axis=1)
     half = np.concatenate([f[:, [1, 2]], f[:, [2, 0]], f[:, [0, 1]]])
-    # Of three faces at an edge two run in one sense, whatever they do.
+    # Of three faces at an edge, two always run in the same direction.
     half = half[edges.count[edges.of_face.T.reshape(-1)] == 2]
     repeated: Bool[np.ndarray, " n"] = np.unique(half, axis=0, return_counts=True)[1] > 1
     return {

@@ -1,35 +1,26 @@
-"""Files in and out. Optional libraries are imported inside the functions."""
+"""Readers and writers of mesh files; optional libraries are imported inside functions."""
 
-from ._character import CHARACTER_FORMATS as CHARACTER_FORMATS, read_character as read_character
-from ._clip import (
+from ._animated_mesh import (
     AnimatedMesh as AnimatedMesh,
-    StillMesh as StillMesh,
+    StaticMesh as StaticMesh,
     smooth_normals as smooth_normals,
 )
-from ._garment import GarmentReport as GarmentReport, load_garment as load_garment
-from ._gltf import write_gltf as write_gltf
-from ._html import write_html as write_html
-from ._inspect import Inspection as Inspection, inspect_garment as inspect_garment
+from ._frame_rate import nominal_rate as nominal_rate
+from ._gltf_file import (
+    GLTF_FORMATS as GLTF_FORMATS,
+    GltfFile as GltfFile,
+    nearest_turns as nearest_turns,
+)
+from ._gltf_mesh import read_gltf_meshes as read_gltf_meshes
 from ._mdd import read_mdd as read_mdd, write_mdd as write_mdd
-from ._mend import fit_garment as fit_garment
 from ._mesh_file import (
     GARMENT_FORMATS as GARMENT_FORMATS,
+    mesh_name as mesh_name,
     read_mesh as read_mesh,
     split_part as split_part,
 )
-from ._obj import read_obj as read_obj, write_obj as write_obj
+from ._obj import read_obj as read_obj, write_materials as write_materials, write_obj as write_obj
 from ._pc2 import read_pc2 as read_pc2, write_pc2 as write_pc2
-from ._usd import write_usd as write_usd
-from ._weights import (
-    DEFAULT as DEFAULT,
-    MIRROR as MIRROR,
-    RELAX as RELAX,
-    list_weights as list_weights,
-    load_predictor as load_predictor,
-    read_card as read_card,
-    save_mean as save_mean,
-    save_predictor as save_predictor,
-    split_ways as split_ways,
-    weights_size as weights_size,
-)
+from ._source_mesh import SourceMesh as SourceMesh, joined as joined, named as named
+from ._usd_mesh import read_usd_meshes as read_usd_meshes
 from ._write import EXTENSIONS as EXTENSIONS, check_output as check_output, write_clip as write_clip

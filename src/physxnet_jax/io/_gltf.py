@@ -1,4 +1,4 @@
-"""Animated glTF: a morph target for each frame. For short clips, in browsers and engines."""
+"""Animated glTF with a morph target per frame, for short clips in browsers and engines."""
 
 import pathlib
 from collections.abc import Sequence
@@ -7,31 +7,30 @@ import numpy as np
 from jaxtyping import Int
 
 from ..errors import FormatError, MissingDependencyError
-from ..files import whole_file
+from ..files import atomic_write
 from ..geometry import Texture
-from ._clip import AnimatedMesh, smooth_normals
+from ._animated_mesh import AnimatedMesh, smooth_normals
 
 MAX_FRAMES = 300
-"""Frames that a glTF takes: each is stored whole, and viewers hold all in memory."""
+"""Largest number of frames: each is stored in full, and viewers hold all of them in memory."""
 
 
 def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
-    """Writes meshes as one binary glTF, playing in a loop in most viewers.
+    """Writes meshes as one binary glTF, which most viewers play in a loop.
 
-    Frame 0 is the mesh, every other frame a morph target with positions and normals; one
-    animation goes through them, linear between frames. Each material has a primitive of its
-    own, all over the same vertices, its image within the file. Where texture coordinates
-    part at a seam the vertex is doubled, as glTF asks: the first vertices stay in order
-    only for meshes without ``uv``.
+    Frame 0 is the base mesh; every other frame is a morph target with positions and normals.
+    One animation interpolates linearly between them. Each material has its own primitive over
+    the shared vertices, and its image is embedded. Vertices are duplicated at texture seams,
+    as glTF requires, so the vertex order is kept only for meshes without ``uv``.
 
     Args:
-        path: ``.glb``; written whole or not at all.
-        meshes: What to write; all of the same number of frames.
-        fps: Frames a second.
+        path: ``.glb``; written atomically.
+        meshes: Meshes to write, all with the same number of frames.
+        fps: Frames per second.
 
     Raises:
-        FormatError: More than `MAX_FRAMES` frames.
-        MissingDependencyError: Without pygltflib.
+        FormatError: There are more than `MAX_FRAMES` frames.
+        MissingDependencyError: pygltflib isn't installed.
 
     References:
         Khronos, glTF 2.0, sections 3.7.2.2 (morph targets) and 3.11 (animations).
@@ -44,20 +43,20 @@ def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
     for m in meshes:
         file.add(m)
     file.animate(frames, fps)
-    with whole_file(path) as part, part.open("wb") as target:
+    with atomic_write(path) as part, part.open("wb") as target:
         target.write(b"".join(file.document().save_to_bytes()))
 
 
 def check_gltf(path: str | pathlib.Path, frames: int | None = None) -> None:
-    """Fails as `write_gltf` would, before there is anything to write.
+    """Raises the errors of `write_gltf` before there is anything to write.
 
     Args:
-        path: Named in the error.
-        frames: How many there will be, if that is known.
+        path: File name for the error message.
+        frames: Number of frames, if known.
     """
     if frames is not None and frames > MAX_FRAMES:
         raise FormatError(
-            f"{path}: {frames} frames are too many for glTF, which takes {MAX_FRAMES}: write"
+            f"{path}: {frames} frames are too many for glTF (at most {MAX_FRAMES}): write"
             " .usdc or .pc2, or fewer frames (--frames)."
         )
     try:
@@ -69,7 +68,7 @@ def check_gltf(path: str | pathlib.Path, frames: int | None = None) -> None:
 
 
 class _Builder:
-    """A glTF document and its one buffer while they grow."""
+    """Builds a glTF document and its single buffer."""
 
     def __init__(self, library) -> None:
         self.lib = library
@@ -88,7 +87,7 @@ class _Builder:
         n = smooth_normals(m.positions, m.faces)[:, rows]
         attributes = {"POSITION": self.store(x[0], "VEC3"), "NORMAL": self.store(n[0], "VEC3")}
         if uv is not None:
-            # Images begin at the top in glTF.
+            # In glTF, texture coordinates start at the top of the image.
             attributes["TEXCOORD_0"] = self.store(uv * [1, -1] + [0, 1], "VEC2")
         targets = [
             {
@@ -129,14 +128,14 @@ class _Builder:
         gltf.scenes[0].nodes.append(len(gltf.nodes) - 1)
 
     def image(self, texture: Texture) -> int:
-        """A texture for an image in the buffer; its number."""
+        """Stores an image in the buffer and returns the index of its texture."""
         lib, gltf = self.lib, self.gltf
         if texture not in self.images:
             blob = texture.data or b""
             gltf.bufferViews.append(
                 lib.BufferView(buffer=0, byteOffset=len(self.blob), byteLength=len(blob))
             )
-            # Whatever follows begins at a multiple of four.
+            # The next view must start at a multiple of four bytes.
             self.blob += blob + bytes(-len(blob) % 4)
             kind = "image/png" if texture.ending == ".png" else "image/jpeg"
             view = len(gltf.bufferViews) - 1
@@ -169,7 +168,7 @@ class _Builder:
         )
 
     def store(self, values: np.ndarray, kind: str, *, index: bool = False) -> int:
-        """An accessor for an array; its number."""
+        """Stores an array in the buffer and returns the index of its accessor."""
         lib, gltf = self.lib, self.gltf
         values = np.ascontiguousarray(values, np.uint32 if index else np.float32)
         blob = values.tobytes()
@@ -199,7 +198,7 @@ class _Builder:
 def _split_at_seams(
     m: AnimatedMesh,
 ) -> tuple[Int[np.ndarray, " points"], Int[np.ndarray, "faces 3"], np.ndarray | None]:
-    """Rows of the mesh's vertices, triangles over them and their texture coordinates."""
+    """Splits vertices at texture seams: original vertices, triangles, texture coordinates."""
     if m.uv is None or m.uv_faces is None:
         return np.arange(m.positions.shape[1]), m.faces, None
     corners = np.stack([m.faces.reshape(-1), m.uv_faces.reshape(-1)], axis=1)

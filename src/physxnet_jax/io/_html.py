@@ -1,4 +1,4 @@
-"""A page that shows a clip by itself: a glTF and a viewer for it in one file."""
+"""A self-contained HTML page that plays a clip: a glTF and its viewer in one file."""
 
 import base64
 import html
@@ -10,8 +10,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..files import whole_file
-from ._clip import AnimatedMesh
+from ..files import atomic_write
+from ._animated_mesh import AnimatedMesh
 from ._gltf import write_gltf
 
 _VIEWER = pathlib.Path(__file__).with_name("assets") / "model-viewer.min.js"
@@ -44,61 +44,63 @@ button { min-width: 5em; }
 <output id="shown"></output>
 <span id="parts"></span>
 </form>
-<script id="told" type="application/json">__TOLD__</script>
+<script id="data" type="application/json">__DATA__</script>
 <script type="module">
-const told = JSON.parse(document.getElementById('told').textContent);
+const data = JSON.parse(document.getElementById('data').textContent);
 const [view, play, time, shown, parts] =
   ['view', 'play', 'time', 'shown', 'parts'].map(id => document.getElementById(id));
-const bytes = Uint8Array.from(atob(told.model), c => c.charCodeAt(0));
+const bytes = Uint8Array.from(atob(data.model), c => c.charCodeAt(0));
 view.src = URL.createObjectURL(new Blob([bytes], {type: 'model/gltf-binary'}));
-const last = told.frames - 1;
-const tell = frame => {
+const last = data.frames - 1;
+const show = frame => {
   time.value = frame;
-  shown.textContent = `frame ${frame} of ${last}, ${(frame / told.fps).toFixed(2)} s`;
+  shown.textContent = `frame ${frame} of ${last}, ${(frame / data.fps).toFixed(2)} s`;
 };
 const stop = frame => {
   view.pause();
   play.textContent = 'play';
   // The very end would wrap to the start.
-  view.currentTime = Math.min(frame / told.fps, Math.max(last / told.fps - 1e-4, 0));
-  tell(frame);
+  view.currentTime = Math.min(frame / data.fps, Math.max(last / data.fps - 1e-4, 0));
+  show(frame);
 };
-const wear = (name, worn) => {
-  for (const [number, colour] of told.meshes[name]) {
+const setVisible = (name, visible) => {
+  for (const [number, colour] of data.meshes[name]) {
     const material = view.model.materials[number];
-    material.setAlphaMode(worn ? 'OPAQUE' : 'MASK');
-    material.pbrMetallicRoughness.setBaseColorFactor([...colour, worn ? 1 : 0]);
+    material.setAlphaMode(visible ? 'OPAQUE' : 'MASK');
+    material.pbrMetallicRoughness.setBaseColorFactor([...colour, visible ? 1 : 0]);
   }
 };
 view.addEventListener('load', () => {
-  for (const name of Object.keys(told.meshes)) {
+  for (const name of Object.keys(data.meshes)) {
     const label = document.createElement('label');
     const box = Object.assign(document.createElement('input'), {type: 'checkbox', checked: true});
-    box.addEventListener('change', () => wear(name, box.checked));
+    box.addEventListener('change', () => setVisible(name, box.checked));
     label.append(box, ' ', name);
     parts.append(label);
   }
   // page.html#frame=12&without=top opens at a frame, without a mesh.
-  const asked = new URLSearchParams(location.hash.slice(1));
-  for (const name of asked.getAll('without')) {
-    if (!(name in told.meshes)) continue;
-    wear(name, false);
-    parts.children[Object.keys(told.meshes).indexOf(name)].firstChild.checked = false;
+  const params = new URLSearchParams(location.hash.slice(1));
+  for (const name of params.getAll('without')) {
+    if (!(name in data.meshes)) continue;
+    setVisible(name, false);
+    parts.children[Object.keys(data.meshes).indexOf(name)].firstChild.checked = false;
   }
-  if (asked.has('frame')) stop(Math.min(Math.max(Math.round(+asked.get('frame')) || 0, 0), last));
+  if (params.has('frame')) {
+    stop(Math.min(Math.max(Math.round(+params.get('frame')) || 0, 0), last));
+  }
   document.body.dataset.state = 'loaded';
 });
 view.addEventListener('error', e => { shown.textContent = `can't be shown: ${e.detail.type}`; });
 play.addEventListener('click', () => {
   if (view.paused) { view.play(); play.textContent = 'pause'; }
-  else stop(Math.round(view.currentTime * told.fps) % told.frames);
+  else stop(Math.round(view.currentTime * data.fps) % data.frames);
 });
 time.addEventListener('input', () => stop(+time.value));
 const follow = () => {
-  if (!view.paused && last > 0) tell(Math.round(view.currentTime * told.fps) % told.frames);
+  if (!view.paused && last > 0) show(Math.round(view.currentTime * data.fps) % data.frames);
   requestAnimationFrame(follow);
 };
-tell(0);
+show(0);
 follow();
 </script>
 </body>
@@ -107,32 +109,32 @@ follow();
 
 
 def write_html(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
-    """Writes a page that plays the clip in any browser, without a network.
+    """Writes a self-contained HTML page that plays the clip in any browser.
 
-    Orbit with the mouse; play, stop and scrub; every mesh can be hidden. The address
-    ``page.html#frame=12&without=top`` opens at a frame, without a mesh. What limits
-    `write_gltf` limits this too.
+    The page needs no network. The mouse orbits the camera, playback can be paused and scrubbed,
+    and every mesh can be hidden. The address ``page.html#frame=12&without=top`` opens the page
+    at a frame, without a mesh. The limits of `write_gltf` apply.
 
     Args:
-        path: ``.html``; written whole or not at all.
-        meshes: What to show; all of the same number of frames.
-        fps: Frames a second.
+        path: ``.html``; written atomically.
+        meshes: Meshes to show, all with the same number of frames.
+        fps: Frames per second.
 
     Raises:
-        FormatError: Too many frames.
-        MissingDependencyError: Without pygltflib.
+        FormatError: There are too many frames.
+        MissingDependencyError: pygltflib isn't installed.
     """
     path = pathlib.Path(path)
     with tempfile.TemporaryDirectory(prefix="physxnet_") as folder:
         model = pathlib.Path(folder) / "clip.glb"
         write_gltf(model, meshes, fps)
-        told = {
+        contents = {
             "frames": len(meshes[0].positions),
             "fps": fps,
             "meshes": _materials(meshes),
             "model": base64.b64encode(model.read_bytes()).decode(),
         }
-    # The whole clip stays in sight: its ball fills the view of 30 degrees.
+    # The bounding sphere of the clip fills the field of view of 30 degrees.
     low = np.min([m.positions.min(axis=(0, 1)) for m in meshes], axis=0)
     high = np.max([m.positions.max(axis=(0, 1)) for m in meshes], axis=0)
     away = float(np.linalg.norm(high - low)) * 0.5 / np.sin(np.radians(15.0))
@@ -141,20 +143,20 @@ def write_html(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
         "__FARTHEST__": f"{3 * away:.3f}",
         "__MIDDLE__": " ".join(f"{x:.3f}m" for x in (low + high) / 2),
         "__TITLE__": html.escape(path.stem),
-        "__LAST__": str(told["frames"] - 1),
-        # Neither text may close the element that holds it.
-        "__TOLD__": json.dumps(told).replace("<", "\\u003c"),
+        "__LAST__": str(contents["frames"] - 1),
+        # Neither text may close its enclosing element.
+        "__DATA__": json.dumps(contents).replace("<", "\\u003c"),
         "__VIEWER__": _VIEWER.read_text(encoding="utf-8").replace("</script", "<\\/script"),
     }
     page = _PAGE
     for name, text in parts.items():
         page = page.replace(name, text)
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_text(page, encoding="utf-8")
 
 
 def _materials(meshes: Sequence[AnimatedMesh]) -> dict[str, list[tuple[int, list[float]]]]:
-    """Numbers of each mesh's materials in the glTF, and their colours."""
+    """Indices of each mesh's materials in the glTF, and their colours."""
     number = itertools.count()
     return {
         m.name: [(next(number), list(map(float, look.colour))) for look in m.looks] for m in meshes

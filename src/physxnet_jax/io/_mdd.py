@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import FormatError
-from ..files import whole_file
+from ..files import atomic_write
 
 _HEADER = struct.Struct(">ii")
 
@@ -15,13 +15,13 @@ _HEADER = struct.Struct(">ii")
 def write_mdd(
     path: str | pathlib.Path, positions: Float[np.ndarray, "frames vertices 3"], fps: float
 ) -> None:
-    """Writes a cache of positions [m], atomically; frame 0 is at second 0.
+    """Writes a cache of positions [m], atomically; frame 0 is at time 0.
 
     References:
         NewTek's LightWave SDK: big-endian counts, times [s], then positions by frame.
     """
     frames, vertices, _ = positions.shape
-    with whole_file(path) as part, part.open("wb") as file:
+    with atomic_write(path) as part, part.open("wb") as file:
         file.write(_HEADER.pack(frames, vertices))
         file.write((np.arange(frames) / fps).astype(">f4").tobytes())
         file.write(np.ascontiguousarray(positions, dtype=">f4").tobytes())
@@ -30,10 +30,10 @@ def write_mdd(
 def read_mdd(
     path: str | pathlib.Path,
 ) -> tuple[Float[np.ndarray, "frames vertices 3"], Float[np.ndarray, " frames"]]:
-    """Positions [m] and times [s] of an MDD cache.
+    """Reads the positions [m] and times [s] of an MDD cache.
 
     Raises:
-        FormatError: Its length isn't the one that its header announces.
+        FormatError: The file's length doesn't match its header.
     """
     blob = pathlib.Path(path).read_bytes()
     if len(blob) < _HEADER.size:
@@ -41,8 +41,8 @@ def read_mdd(
     frames, vertices = _HEADER.unpack_from(blob)
     if frames < 1 or vertices < 1 or len(blob) != _HEADER.size + 4 * frames * (1 + 3 * vertices):
         raise FormatError(
-            f"{path}: {len(blob)} bytes, but an MDD header would announce {frames} frames of"
-            f" {vertices} points. It is truncated, or no MDD."
+            f"{path}: {len(blob)} bytes, but an MDD header would declare {frames} frames of"
+            f" {vertices} points. It is truncated, or not MDD."
         )
     data = np.frombuffer(blob, ">f4", offset=_HEADER.size).astype(np.float32)
     return data[frames:].reshape(frames, vertices, 3), data[:frames]

@@ -10,38 +10,39 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ..errors import FormatError
-from ..files import is_file, whole_file
+from ..files import atomic_write, is_file
 from ..geometry import Material, Polygons, Texture, make_material
-from ._chart import Move, make_move, moved_charts
-from ._clip import StillMesh
+from ._animated_mesh import StaticMesh
 from ._texture import texture_beside, write_textures
+from ._uv_transform import UvTransform, make_uv_transform, transform_uvs
 
 _MAX_BYTES = 500_000_000
 _MAX_LIBRARY = 5_000_000
-_FARTHEST = 1e18
+_MAX_COORDINATE = 1e18
 _INDEX = re.compile(r"[+-]?[0-9]{1,18}")
 _NONE = "default"
-# Options of an image in a material file and how many words follow them, for some at most.
+# Options of an image in a material file, with their number of arguments (the largest for some).
 _OPTIONS = {"blendu": 1, "blendv": 1, "bm": 1, "boost": 1, "cc": 1, "clamp": 1, "imfchan": 1}
 _OPTIONS |= {"mm": 2, "texres": 1, "type": 1}
 _NUMBERS = {"o": 3, "s": 3, "t": 3}
 
 
-def read_obj(path: str | pathlib.Path, part: str | None = None) -> StillMesh:
-    """Reads an OBJ; quads are split along their shorter diagonal, others in a fan.
+def read_obj(path: str | pathlib.Path, part: str | None = None) -> StaticMesh:
+    """Reads an OBJ; quads are split along their shorter diagonal, other polygons as fans.
 
     Args:
         path: The file.
-        part: Name of the object to take, or of the group in a file without objects; all
+        part: Name of the object to read, or of the group in a file without objects; all
             of them if omitted.
 
     Returns:
         The mesh; vertex order is kept. Polygons keep the names of their materials, and the
-        colours and images that a material file beside it tells.
+        colours and images that the material files beside it define.
 
     Raises:
-        FormatError: Missing, empty, binary or malformed files; indices out of range;
-            values that aren't finite; no part of that name. File, line and fix are named.
+        FormatError: The file is missing, empty, binary or malformed, an index is out of
+            range, a value isn't finite, or no part has that name. The message names the file,
+            the line and a remedy.
     """
     path = pathlib.Path(path)
     if not is_file(path):
@@ -51,62 +52,66 @@ def read_obj(path: str | pathlib.Path, part: str | None = None) -> StillMesh:
     blob = path.read_bytes()
     if b"\0" in blob[:4096]:
         raise FormatError(f"{path}: binary data, not OBJ text. Export as OBJ.")
-    told = _gathered(blob.decode("utf-8", "replace"))
-    if not told.vertices or not told.faces:
+    parsed = _parse_lines(blob.decode("utf-8", "replace"))
+    if not parsed.vertices or not parsed.faces:
         raise FormatError(
-            f"{path}: {len(told.vertices)} vertices and {len(told.faces)} faces; a mesh needs"
+            f"{path}: {len(parsed.vertices)} vertices and {len(parsed.faces)} faces; a mesh needs"
             " both. Export the mesh with its faces."
         )
-    v = _numbers(path, told.vertices, told.vertex_lines, 3)
-    uv = _numbers(path, told.uv, told.uv_lines, 2)
-    counts = np.asarray([len(words) for words in told.faces])
-    corners = _corners(path, told, counts, (len(v), len(uv)))
-    material = np.asarray(told.material, np.int32)
-    owner = told.objects if any(told.objects) else told.groups
+    v = _numbers(path, parsed.vertices, parsed.vertex_lines, 3)
+    uv = _numbers(path, parsed.uv, parsed.uv_lines, 2)
+    counts = np.asarray([len(words) for words in parsed.faces])
+    corners = _corners(path, parsed, counts, (len(v), len(uv)))
+    material = np.asarray(parsed.material, np.int32)
+    owner = parsed.objects if any(parsed.objects) else parsed.groups
     parts = tuple(sorted({name for name in owner if name}))
     if part is not None:
-        mine = np.asarray([name == part for name in owner])
-        if not mine.any():
+        selected = np.asarray([name == part for name in owner])
+        if not selected.any():
             there = ", ".join(parts)[:300] or "one mesh without a name"
             raise FormatError(f"{path}: no mesh '{part}'; there is {there}.")
-        corners, counts, material = corners[np.repeat(mine, counts)], counts[mine], material[mine]
-        # The others' vertices belong to no face any more; the order stays.
+        corners, counts, material = (
+            corners[np.repeat(selected, counts)],
+            counts[selected],
+            material[selected],
+        )
+        # Vertices of other parts are dropped; the order is kept.
         kept, at = np.unique(corners[:, 0], return_inverse=True)
         v, corners = v[kept], np.column_stack([at.reshape(-1), corners[:, 1]])
         parts = (part,)
     table = corners[_split(counts, v[corners[:, 0]])]
     has_uv = len(uv) > 0 and bool((corners[:, 1] >= 0).all())
-    looks = _looks(path, told.libraries)
+    looks = _looks(path, parsed.libraries)
     drawn = Polygons(
         counts.astype(np.int32),
         corners[:, 0].astype(np.int32),
         corners[:, 1].astype(np.int32) if has_uv else None,
         material,
-        tuple(looks[n].material if n in looks else Material(n) for n in told.names),
+        tuple(looks[n].material if n in looks else Material(n) for n in parsed.names),
     )
     chart, chart_faces = (uv, table[..., 1]) if has_uv else (None, None)
     if chart is not None and chart_faces is not None:
-        moves = {k: looks[n].move for k, n in enumerate(told.names) if n in looks}
-        chart, chart_faces, drawn = moved_charts(
+        moves = {k: looks[n].move for k, n in enumerate(parsed.names) if n in looks}
+        chart, chart_faces, drawn = transform_uvs(
             chart, chart_faces, drawn, {k: m for k, m in moves.items() if m is not None}
         )
-    return StillMesh(v, table[..., 0], chart, chart_faces, drawn, len(counts), parts)
+    return StaticMesh(v, table[..., 0], chart, chart_faces, drawn, len(counts), parts)
 
 
-class _Told(NamedTuple):
-    """What the lines of a file say, word by word.
+class _ObjData(NamedTuple):
+    """The words of a file's lines, by keyword.
 
     Attributes:
         vertices: Words of each vertex.
-        vertex_lines: Lines they stand in, from 1.
+        vertex_lines: Their line numbers, from 1.
         uv: Words of each texture coordinate.
-        uv_lines: Their lines.
+        uv_lines: Their line numbers.
         faces: Words of each face's corners.
-        face_lines: Their lines.
-        before: Vertices and texture coordinates that there were before each face.
-        material: Place of each face's material in ``names``; -1 without one.
-        objects: Name of the object each face is in.
-        groups: Name of its group.
+        face_lines: Their line numbers.
+        before: Number of vertices and of texture coordinates before each face.
+        material: Index of each face's material in ``names``; -1 without one.
+        objects: Name of each face's object.
+        groups: Name of each face's group.
         names: Materials, in the order of their first use.
         libraries: Material files.
     """
@@ -125,8 +130,8 @@ class _Told(NamedTuple):
     libraries: list[str]
 
 
-def _gathered(text: str) -> _Told:
-    told = _Told(*([] for _ in _Told._fields))
+def _parse_lines(text: str) -> _ObjData:
+    parsed = _ObjData(*([] for _ in _ObjData._fields))
     places: dict[str, int] = {}
     used, current = -1, {"o": "", "g": ""}
     for n, line in enumerate(text.splitlines(), start=1):
@@ -135,39 +140,39 @@ def _gathered(text: str) -> _Told:
             continue
         key = words[0]
         if key == "v":
-            told.vertices.append(words[1:4])
-            told.vertex_lines.append(n)
+            parsed.vertices.append(words[1:4])
+            parsed.vertex_lines.append(n)
         elif key == "vt":
-            told.uv.append([*words[1:3], "0"][:2])
-            told.uv_lines.append(n)
+            parsed.uv.append([*words[1:3], "0"][:2])
+            parsed.uv_lines.append(n)
         elif key == "f":
-            told.faces.append(words[1:])
-            told.face_lines.append(n)
-            told.before.append((len(told.vertices), len(told.uv)))
-            told.material.append(used)
-            told.objects.append(current["o"])
-            told.groups.append(current["g"])
+            parsed.faces.append(words[1:])
+            parsed.face_lines.append(n)
+            parsed.before.append((len(parsed.vertices), len(parsed.uv)))
+            parsed.material.append(used)
+            parsed.objects.append(current["o"])
+            parsed.groups.append(current["g"])
         elif key in current:
-            current[key] = _rest(line)
+            current[key] = _after_keyword(line)
         elif key == "usemtl":
-            used = places.setdefault(_rest(line), len(places))
+            used = places.setdefault(_after_keyword(line), len(places))
         elif key == "mtllib":
-            told.libraries.append(_rest(line))
-    told.names.extend(places)
-    return told
+            parsed.libraries.append(_after_keyword(line))
+    parsed.names.extend(places)
+    return parsed
 
 
 def _numbers(
     path: pathlib.Path, rows: list[list[str]], lines: list[int], count: int
 ) -> Float[np.ndarray, "rows numbers"]:
-    """Numbers of lines, all at once; one by one where something is wrong, to say where."""
+    """Parses the numbers of all lines at once; after an error line by line, to locate it."""
     try:
         flat = np.array([float(w) for words in rows for w in words])
     except ValueError:
         flat = np.zeros(0)
-    # Beyond that their squares aren't finite in float32.
+    # Squares of larger numbers may overflow float32.
     whole = all(len(words) == count for words in rows) and len(flat) == count * len(rows)
-    if whole and (np.abs(flat) < _FARTHEST).all():
+    if whole and (np.abs(flat) < _MAX_COORDINATE).all():
         return flat.reshape(-1, count)
     for n, words in zip(lines, rows, strict=True):
         try:
@@ -176,7 +181,7 @@ def _numbers(
             raise FormatError(
                 f"{path}:{n}: '{' '.join(words)[:60]}' aren't numbers. Export again."
             ) from None
-        if len(values) != count or not all(abs(x) < _FARTHEST for x in values):
+        if len(values) != count or not all(abs(x) < _MAX_COORDINATE for x in values):
             raise FormatError(
                 f"{path}:{n}: expected {count} finite numbers, got {values}. Export again."
             )
@@ -184,14 +189,14 @@ def _numbers(
 
 
 def _corners(
-    path: pathlib.Path, told: _Told, counts: Int[np.ndarray, " faces"], there: tuple[int, int]
+    path: pathlib.Path, parsed: _ObjData, counts: Int[np.ndarray, " faces"], there: tuple[int, int]
 ) -> Int[np.ndarray, "corners 2"]:
-    """Vertex and texture coordinate of every corner, from 0; -1 without one."""
-    words = [word for face in told.faces for word in face]
+    """Indices of every corner's vertex and texture coordinate, from 0; -1 without one."""
+    words = [word for face in parsed.faces for word in face]
     face = np.repeat(np.arange(len(counts)), counts)
 
     def fail(corner: int, problem: str) -> FormatError:
-        line, word = told.face_lines[face[corner]], words[corner][:40]
+        line, word = parsed.face_lines[face[corner]], words[corner][:40]
         return FormatError(f"{path}:{line}: '{word}' {problem}. Export again.")
 
     pairs = [[*word.split("/"), ""][:2] for word in words]
@@ -203,7 +208,7 @@ def _corners(
                 raise fail(k, "isn't a face corner") from None
         raise FormatError(f"{path}: faces that can't be read. Export again.") from None
     index = index.reshape(-1, 2)
-    before = np.asarray(told.before)[face]
+    before = np.asarray(parsed.before)[face]
     given = np.array([bool(t) for _, t in pairs], bool)
     wrong = (index[:, 0] == 0) | (given & (index[:, 1] == 0)) | (index[:, 1] < -before[:, 1])
     if wrong.any():
@@ -215,13 +220,13 @@ def _corners(
     new |= np.diff(face[order], prepend=-1) != 0
     few = np.bincount(face[order][new], minlength=len(counts)) < 3
     if few.any():
-        line = told.face_lines[int(few.argmax())]
+        line = parsed.face_lines[int(few.argmax())]
         raise FormatError(f"{path}:{line}: a face of fewer than three vertices. Delete it.")
-    lost = (out[:, 0] < 0) | (out[:, 0] >= there[0]) | (out[:, 1] >= there[1])
-    if lost.any():
-        k = int(lost.argmax())
+    out_of_range = (out[:, 0] < 0) | (out[:, 0] >= there[0]) | (out[:, 1] >= there[1])
+    if out_of_range.any():
+        k = int(out_of_range.argmax())
         raise FormatError(
-            f"{path}:{told.face_lines[face[k]]}: a face names vertex {out[k, 0] + 1} or uv"
+            f"{path}:{parsed.face_lines[face[k]]}: a face refers to vertex {out[k, 0] + 1} or uv"
             f" {out[k, 1] + 1}, but there are {there[0]} and {there[1]}. Export the file again."
         )
     return out
@@ -230,7 +235,7 @@ def _corners(
 def _split(
     counts: Int[np.ndarray, " faces"], points: Float[np.ndarray, "corners 3"]
 ) -> Int[np.ndarray, "triangles 3"]:
-    """Triangles of faces, as rows of their corners: a quad along its shorter diagonal."""
+    """Splits faces into triangles of corner rows, quads along their shorter diagonal."""
     starts = np.cumsum(counts) - counts
     turned = np.zeros(len(counts), np.int64)
     quads = np.flatnonzero(counts == 4)
@@ -244,18 +249,18 @@ def _split(
 
 
 class _Look(NamedTuple):
-    """A material, and how it moves texture coordinates."""
+    """A material, and its transform of texture coordinates."""
 
     material: Material
-    move: Move | None
+    move: UvTransform | None
 
 
 def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
-    """Materials of the material files beside a mesh; what can't be read tells nothing."""
+    """Materials of the material files beside a mesh; unreadable ones are ignored."""
     found: dict[str, _Look] = {}
     images: dict[str, Texture] = {}
     for library in dict.fromkeys(libraries):
-        # Only what lies beside it: a name may lead anywhere.
+        # Only files in the same folder: the name may be any path.
         file = path.parent / pathlib.PurePath(library.replace("\\", "/")).name
         if not is_file(file) or file.stat().st_size > _MAX_LIBRARY:
             continue
@@ -263,7 +268,7 @@ def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
         for line in file.read_bytes().decode("utf-8", "replace").splitlines():
             words = line.split("#")[0].split()
             if words[:1] == ["newmtl"]:
-                name, colour, image, move = _rest(line), None, None, None
+                name, colour, image, move = _after_keyword(line), None, None, None
             elif words[:1] == ["Kd"]:
                 with contextlib.suppress(ValueError):
                     colour = [float(w) for w in words[1:4]]
@@ -273,18 +278,18 @@ def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
                 if image is None:
                     image = images[named] = texture_beside(file, named)
             if name is not None:
-                # Beside an image most programs write a grey that none of them multiplies by.
+                # Most programs write a grey beside an image, but none multiplies the image by it.
                 plain = image is None or image.data is None
                 material = make_material(name, colour if plain else None, image)
                 found[name] = _Look(material, None if plain else move)
     return found
 
 
-def _image(line: str) -> tuple[str, Move | None]:
-    """What `map_Kd` names, and how its options move coordinates; names may have spaces."""
-    rest = _rest(line)
+def _image(line: str) -> tuple[str, UvTransform | None]:
+    """Image and coordinate transform of a `map_Kd` line; names may contain spaces."""
+    rest = _after_keyword(line)
     words = rest.split()
-    told = {"s": [1.0, 1.0], "o": [0.0, 0.0]}
+    parsed = {"s": [1.0, 1.0], "o": [0.0, 0.0]}
     at = 0
     while words[at].startswith("-"):
         key = words[at][1:].lower()
@@ -295,16 +300,16 @@ def _image(line: str) -> tuple[str, Move | None]:
             except ValueError:
                 break
             after += 1
-            if key in told and k < 2:
-                told[key][k] = value
+            if key in parsed and k < 2:
+                parsed[key][k] = value
         if after >= len(words):
             break
         at = after
-    return rest.split(None, at)[-1], make_move(told["s"], told["o"])
+    return rest.split(None, at)[-1], make_uv_transform(parsed["s"], parsed["o"])
 
 
-def _rest(line: str) -> str:
-    """What follows the first word; names may have spaces."""
+def _after_keyword(line: str) -> str:
+    """The line after its first word; names may contain spaces."""
     return "".join(line.strip().split(None, 1)[1:]).strip()
 
 
@@ -326,8 +331,8 @@ def write_obj(
         faces: Triangles.
         uv: Texture coordinates.
         uv_faces: Corners in ``uv``.
-        polygons: What is written in place of the triangles, with names of materials.
-        library: Name of the material file beside it, by `write_materials`.
+        polygons: Polygons to write instead of the triangles, with names of materials.
+        library: Name of the material file beside it, see `write_materials`.
     """
     lines = [] if library is None else [f"mtllib {library}"]
     lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in np.asarray(vertices)]
@@ -349,11 +354,11 @@ def write_obj(
         polygons.starts, polygons.counts, polygons.material, strict=True
     ):
         if which != used:
-            # What has none would otherwise be taken for what was before it.
+            # Without this line, faces without a material would inherit the previous one.
             lines.append(f"usemtl {polygons.materials[which].name if which >= 0 else _NONE}")
         used = which
         lines.append("f " + " ".join(words[start : start + count]))
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
@@ -361,7 +366,7 @@ def write_materials(path: str | pathlib.Path, materials: Sequence[Material]) -> 
     """Writes an MTL of the materials' names and colours, and their images beside it.
 
     Returns:
-        The files written, each whole or not at all.
+        The files written, each atomically.
     """
     path = pathlib.Path(path)
     images = write_textures(path, [m.texture for m in materials])
@@ -374,6 +379,6 @@ def write_materials(path: str | pathlib.Path, materials: Sequence[Material]) -> 
             lines.append("Kd " + " ".join(f"{c:.6g}" for c in colour))
         if image is not None:
             lines.append(f"map_Kd {image.name}")
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return [path, *images.values()]

@@ -7,25 +7,25 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import FormatError
-from ..files import whole_file
+from ..files import atomic_write
 
 _HEADER = struct.Struct("<12siiffi")
 
 
 def write_pc2(path: str | pathlib.Path, positions: Float[np.ndarray, "frames vertices 3"]) -> None:
-    """Writes a cache of positions [m], one sample a frame from frame 0, atomically."""
+    """Writes a cache of positions [m], one sample per frame from frame 0, atomically."""
     frames, vertices, _ = positions.shape
-    with whole_file(path) as part, part.open("wb") as file:
+    with atomic_write(path) as part, part.open("wb") as file:
         file.write(_HEADER.pack(b"POINTCACHE2\0", 1, vertices, 0.0, 1.0, frames))
         file.write(np.ascontiguousarray(positions, dtype="<f4").tobytes())
 
 
 def read_pc2(path: str | pathlib.Path) -> Float[np.ndarray, "frames vertices 3"]:
-    """Positions of a PC2 cache.
+    """Reads the positions of a PC2 cache.
 
     Raises:
-        FormatError: Not a PC2, shorter than its header says, or without a sample for
-            every frame.
+        FormatError: The file isn't PC2, its length doesn't match its header, or it hasn't
+            one sample per frame.
     """
     blob = pathlib.Path(path).read_bytes()
     if len(blob) < _HEADER.size or not blob.startswith(b"POINTCACHE2\0"):
@@ -33,7 +33,7 @@ def read_pc2(path: str | pathlib.Path) -> Float[np.ndarray, "frames vertices 3"]
     _, _, vertices, _, step, frames = _HEADER.unpack_from(blob)
     if vertices < 1 or frames < 1 or len(blob) != _HEADER.size + 12 * vertices * frames:
         raise FormatError(
-            f"{path}: {len(blob)} bytes, but the header announces {frames} frames of"
+            f"{path}: {len(blob)} bytes, but the header declares {frames} frames of"
             f" {vertices} points. It is truncated: write it again."
         )
     if not (np.isfinite(step) and abs(step - 1.0) < 1e-3):

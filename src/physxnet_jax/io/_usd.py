@@ -1,5 +1,5 @@
 # pyright: reportAttributeAccessIssue=false
-"""USD: constant topology, time samples, metres, Y up."""
+"""Writes USD: constant topology, time samples, metres, Y up."""
 
 import pathlib
 import re
@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import MissingDependencyError
-from ..files import whole_file
+from ..files import atomic_write
 from ..geometry import Texture
-from ._clip import AnimatedMesh, Look, smooth_normals, vertex_velocities
+from ._animated_mesh import AnimatedMesh, Look, smooth_normals, vertex_velocities
 from ._texture import write_textures
 
 
@@ -21,32 +21,32 @@ def write_usd(
     """Writes meshes as one animated stage.
 
     Each mesh is a prim under ``/Person`` with points, normals, velocities and extent
-    as time samples (frame 0 first), ``st`` texture coordinates and no subdivision. Polygons
-    and materials are those of the mesh, a subset of faces for each of several, their images
-    beside the stage; a mesh without any has a preview material of its colour. The stage's up
-    axis is Y, its unit the metre, its rate ``fps``.
+    as time samples (frame 0 first), ``st`` texture coordinates and no subdivision. It has the
+    polygons and materials of the mesh; several materials are bound to subsets of faces, and
+    images are written beside the stage. A mesh without materials has a preview material of its
+    colour. The stage's up axis is Y, its unit is the metre and its rate is ``fps``.
 
     Args:
-        path: ``.usdc``, ``.usd`` or ``.usda``; written whole or not at all.
-        meshes: What to write; all of the same number of frames.
-        fps: Frames a second.
+        path: ``.usdc``, ``.usd`` or ``.usda``; written atomically.
+        meshes: Meshes to write, all with the same number of frames.
+        fps: Frames per second.
 
     Returns:
         The files written.
 
     Raises:
-        MissingDependencyError: Without usd-core.
+        MissingDependencyError: usd-core isn't installed.
     """
     check_usd()
     path = pathlib.Path(path)
     images = write_textures(path, [look.texture for m in meshes for look in m.looks])
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         _write(part, meshes, fps, {t: image.name for t, image in images.items()})
     return [path, *images.values()]
 
 
 def check_usd() -> None:
-    """Fails where usd-core is missing."""
+    """Raises an error if usd-core isn't installed."""
     try:
         import pxr  # noqa: F401
     except ImportError as error:
@@ -137,11 +137,11 @@ class _Looks:
             material = UsdShade.Material.Define(self.stage, path)
             shader = UsdShade.Shader.Define(self.stage, f"{path}/surface")
             shader.CreateIdAttr("UsdPreviewSurface")
-            told = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
+            diffuse = shader.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f)
             if look.texture is None:
-                told.Set(Gf.Vec3f(*(float(c) for c in look.colour)))
+                diffuse.Set(Gf.Vec3f(*(float(c) for c in look.colour)))
             else:
-                told.ConnectToSource(self._image(path, look).ConnectableAPI(), "rgb")
+                diffuse.ConnectToSource(self._image(path, look).ConnectableAPI(), "rgb")
             shader.CreateInput("roughness", Sdf.ValueTypeNames.Float).Set(0.8)
             material.CreateSurfaceOutput().ConnectToSource(shader.ConnectableAPI(), "surface")
             self.made[key] = material
@@ -173,7 +173,7 @@ class _Looks:
 
 
 def _prim_name(name: str, taken: set[str]) -> str:
-    """A name that USD accepts and no other mesh has."""
+    """A valid USD name that isn't taken."""
     safe = re.sub(r"[^A-Za-z0-9_]", "_", name) or "mesh"
     safe = f"_{safe}" if safe[0].isdigit() else safe
     while safe in taken or safe == "Looks":

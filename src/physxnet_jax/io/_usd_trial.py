@@ -1,7 +1,7 @@
-"""A USD stage is first read by a process that may fail.
+"""Trial reading of a USD stage in a subprocess that may fail.
 
-Its library believes what a binary file says of its own lengths: a damaged kilobyte takes
-gigabytes, or the process down. So does text that is nested without end or refers to itself.
+usd-core trusts the lengths in a binary file: a damaged kilobyte can take gigabytes of memory or
+crash the process. So can text that is nested without end or refers to itself.
 """
 
 import pathlib
@@ -13,19 +13,19 @@ import numpy as np
 
 from ..errors import FormatError
 
-# What a reader takes beside the file, and for each byte of it [bytes].
+# Memory limit of the subprocess: a constant, and a share per byte of the file [bytes].
 _BASE, _PER_BYTE = 1_500_000_000, 20
-# What it may take [s], and for each byte.
+# Time limit of the subprocess: a constant, and a share per byte of the file [s].
 _SECONDS, _SECONDS_PER_BYTE = 20.0, 1e-6
 
-# What composes a stage of others, or of itself several times over.
-_REFERS = re.compile(rb"@|\b(references|inherits|specializes|payload|variantSets?)\b")
-# Brackets within brackets that a stage of plain meshes has at most.
-_DEEPEST = 100
-# Bytes looked at in one go.
+# Syntax that composes a stage from others, or repeatedly from itself.
+_COMPOSITION = re.compile(rb"@|\b(references|inherits|specializes|payload|variantSets?)\b")
+# Deepest nesting of brackets in a stage of plain meshes.
+_MAX_DEPTH = 100
+# Bytes to scan at a time.
 _PIECE = 1 << 20
 
-# Everything that could be asked for is read once.
+# Reads every attribute once at all its times.
 _TRIAL = """
 import sys
 try:
@@ -44,32 +44,31 @@ for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies()):
 
 
 def _depth(text: bytes) -> int:
-    """How deep brackets lie within each other, those in quotes counted too."""
+    """Deepest nesting of brackets, including those in quotes."""
     step = np.zeros(256, np.int8)
     step[list(b"{[(")], step[list(b"}])")] = 1, -1
-    depth = most = 0
+    depth = deepest = 0
     for at in range(0, len(text), _PIECE):
-        piece = np.frombuffer(text, np.uint8, min(_PIECE, len(text) - at), at)
-        depths = depth + np.cumsum(step[piece], dtype=np.int64)
-        depth, most = int(depths[-1]), max(most, int(depths.max()))
-    return most
+        chunk = np.frombuffer(text, np.uint8, min(_PIECE, len(text) - at), at)
+        depths = depth + np.cumsum(step[chunk], dtype=np.int64)
+        depth, deepest = int(depths[-1]), max(deepest, int(depths.max()))
+    return deepest
 
 
 def try_stage(path: pathlib.Path) -> None:
-    """Reads a stage in a process of its own with bounded memory and time.
+    """Reads a stage in a subprocess with bounded memory and time.
 
-    Plain text, flat and without references, is left to the reader, which stops where it ends.
-
-    Where no Python can be started (embedded, or forbidden) nothing is tried.
+    Plain text that is flat and has no references isn't tried, because reading it is bounded by
+    its length. Nothing is tried where no Python can be started (embedded, or forbidden).
 
     Raises:
-        FormatError: It takes too long for its size.
-        ValueError: It can't be read in as much memory, or at all.
+        FormatError: Reading takes too long for the file's size.
+        ValueError: The stage can't be read within the memory limit, or at all.
     """
     if not pathlib.Path(sys.executable or "").name.startswith("python"):
         return
     text = path.read_bytes()
-    if text.startswith(b"#usda") and not _REFERS.search(text) and _depth(text) <= _DEEPEST:
+    if text.startswith(b"#usda") and not _COMPOSITION.search(text) and _depth(text) <= _MAX_DEPTH:
         return
     beside = {path, *path.parent.glob("*.usd*"), *path.parent.glob("*/*.usd*")}
     size = sum(p.stat().st_size for p in beside if p.is_file())
@@ -83,7 +82,7 @@ def try_stage(path: pathlib.Path) -> None:
         )
     except subprocess.TimeoutExpired:
         raise FormatError(
-            f"{path}: its size doesn't account for the time it takes to read. Export it again."
+            f"{path}: reading takes too much time for its size. Export it again."
         ) from None
     except OSError:
         return

@@ -1,4 +1,4 @@
-"""One door for every output: the extension decides."""
+"""Writes clips in the format that the file's extension selects."""
 
 import itertools
 import pathlib
@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import FormatError
-from ..files import check_writable, whole_file
-from ._clip import AnimatedMesh
+from ..files import atomic_write, check_writable
+from ._animated_mesh import AnimatedMesh
 from ._gltf import check_gltf, write_gltf
 from ._html import write_html
 from ._mdd import write_mdd
@@ -18,21 +18,24 @@ from ._pc2 import write_pc2
 from ._usd import check_usd, write_usd
 
 EXTENSIONS = (".usdc", ".usd", ".usda", ".pc2", ".mdd", ".glb", ".html", ".obj", ".npz")
-# What no file's name may have in it on some system.
-_UNFIT = re.compile(r'[\\/:*?"<>|\x00-\x1f]')
+# Characters that file names may not contain on some system.
+_INVALID = re.compile(r'[\\/:*?"<>|\x00-\x1f]')
 
 
 def check_output(path: str | pathlib.Path, frames: int | None = None) -> pathlib.Path:
-    """The path, if a clip can be written to it: asked before minutes are spent on one.
+    """Checks that a clip can be written to a path, before minutes are spent on computing it.
 
     Args:
-        path: Where to.
-        frames: How many there will be, if that is known.
+        path: Output path.
+        frames: Number of frames, if known.
+
+    Returns:
+        The path.
 
     Raises:
-        FormatError: Another extension, whose text lists them, too many frames, or a place
-            where nothing can be written.
-        MissingDependencyError: A library that the format needs isn't there.
+        FormatError: The extension is unknown (the message lists the known ones), there are too
+            many frames, or the path isn't writable.
+        MissingDependencyError: A library that the format needs isn't installed.
     """
     path = pathlib.Path(path)
     if path.suffix.lower() not in EXTENSIONS:
@@ -52,26 +55,25 @@ def write_clip(
 ) -> list[pathlib.Path]:
     """Writes a clip.
 
-    ``.usdc``, ``.usd``, ``.usda``: one stage, images of materials beside it as
-    ``STEM_IMAGE.png``. ``.glb``: glTF with a morph target a frame. ``.html``: a page that
-    plays it.
-    ``.npz``: ``NAME_positions``, ``NAME_faces`` and ``fps``. ``.pc2``, ``.mdd``: for each
-    mesh a cache and an OBJ of its first frame with the same vertex order, ``STEM_NAME.pc2``
-    and ``STEM_NAME.obj``. ``.obj``: a file for each mesh and frame, ``STEM_NAME_0000.obj``;
-    what follows their numbers, of a longer clip before, is removed. Where a mesh has
-    materials, ``STEM_NAME.mtl`` is beside them, and their images.
+    ``.usdc``, ``.usd``, ``.usda``: one stage, with images of materials beside it as
+    ``STEM_IMAGE.png``. ``.glb``: glTF with a morph target per frame. ``.html``: a page that
+    plays the clip. ``.npz``: ``NAME_positions``, ``NAME_faces`` and ``fps``. ``.pc2``,
+    ``.mdd``: for each mesh a cache and an OBJ of its first frame with the same vertex order,
+    ``STEM_NAME.pc2`` and ``STEM_NAME.obj``. ``.obj``: a file for each mesh and frame,
+    ``STEM_NAME_0000.obj``; files with the next numbers, left by a longer clip, are removed.
+    If a mesh has materials, ``STEM_NAME.mtl`` and their images are written beside OBJ files.
 
     Args:
-        path: Where to; its ending says in which format.
-        meshes: What to write [m], Y up; all of the same number of frames.
-        fps: Frames a second.
+        path: Output path; its extension selects the format.
+        meshes: Meshes to write [m], Y up, all with the same number of frames.
+        fps: Frames per second.
 
     Returns:
         The files written.
 
     Raises:
-        FormatError: Another extension, or too many frames for glTF.
-        MissingDependencyError: A library that the format needs isn't there.
+        FormatError: The extension is unknown, or there are too many frames for glTF.
+        MissingDependencyError: A library that the format needs isn't installed.
     """
     path = check_output(path)
     suffix = path.suffix.lower()
@@ -82,7 +84,7 @@ def write_clip(
         for m in meshes:
             arrays[f"{m.name}_positions"] = m.positions
             arrays[f"{m.name}_faces"] = m.faces
-        with whole_file(path) as part, part.open("wb") as file:
+        with atomic_write(path) as part, part.open("wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
         return [path]
     if suffix in (".glb", ".html"):
@@ -91,7 +93,7 @@ def write_clip(
         return [path]
     written = []
     for m in meshes:
-        stem = f"{path.stem}_{_UNFIT.sub('_', m.name)}"
+        stem = f"{path.stem}_{_INVALID.sub('_', m.name)}"
         drawn, library = m.polygons, None
         if drawn is not None and drawn.materials:
             library = f"{stem}.mtl"
@@ -101,7 +103,7 @@ def write_clip(
                 frame = path.with_name(f"{stem}_{k:04d}.obj")
                 write_obj(frame, x, m.faces, m.uv, m.uv_faces, polygons=drawn, library=library)
                 written.append(frame)
-            # A longer clip of before would be taken for the rest of this one.
+            # Files left by a longer clip would be taken for the rest of this one.
             for k in itertools.count(len(m.positions)):
                 left = path.with_name(f"{stem}_{k:04d}.obj")
                 if not left.is_file():

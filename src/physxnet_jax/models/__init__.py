@@ -1,44 +1,40 @@
-"""Networks and the predictor built on them. Knows nothing of losses or files."""
+"""Networks, the predictor built on them, and weights on disk; independent of training."""
 
-from ._blocks import (
-    Up as Up,
-    upsample as upsample,
-    upsampling_kernel as upsampling_kernel,
+from ._blocks import Up as Up, upsample as upsample, upsampling_kernel as upsampling_kernel
+from ._bound_garment import (
+    BoundGarment as BoundGarment,
+    apply_offsets as apply_offsets,
+    apply_sampled_offsets as apply_sampled_offsets,
+    bind_garment as bind_garment,
+    dress_frames as dress_frames,
+    pad_clip as pad_clip,
 )
 from ._features import (
     PAPER as PAPER,
     Family as Family,
-    Inputs as Inputs,
+    FeatureConfig as FeatureConfig,
     clip_features as clip_features,
     point_features as point_features,
-    skin_points as skin_points,
 )
 from ._fold import at_precision as at_precision, fold_batch_norm as fold_batch_norm
-from ._mean import MeanGenerator as MeanGenerator, average_networks as average_networks
+from ._mean import average_networks as average_networks
 from ._networks import Discriminator as Discriminator, Generator as Generator
 from ._predictor import (
-    RELAXATION as RELAXATION,
     ModelConfig as ModelConfig,
     Normalisation as Normalisation,
     Predictor as Predictor,
-    Surface as Surface,
-    ask_mirrored as ask_mirrored,
+    TexelPoints as TexelPoints,
     make_generator as make_generator,
-    make_surface as make_surface,
+    make_texel_points as make_texel_points,
     normalise as normalise,
-    relax_cloth as relax_cloth,
+    with_mirror_tta as with_mirror_tta,
 )
-from ._stream import (
-    Stream as Stream,
-    start_stream as start_stream,
-    stream_frame as stream_frame,
-)
-from ._wearable import (
-    Wearable as Wearable,
-    apply_offsets as apply_offsets,
-    dress_frames as dress_frames,
-    make_wearable as make_wearable,
-    pad_clip as pad_clip,
-    pose_windows as pose_windows,
-    skin_wearable as skin_wearable,
+from ._weights import (
+    DEFAULT as DEFAULT,
+    list_weights as list_weights,
+    load_predictor as load_predictor,
+    read_card as read_card,
+    save_mean as save_mean,
+    save_predictor as save_predictor,
+    weights_size as weights_size,
 )

@@ -1,4 +1,4 @@
-"""Building blocks: strided convolution down, transposed convolution up."""
+"""Building blocks: strided convolutions down, transposed convolutions up."""
 
 from typing import Any
 
@@ -8,19 +8,19 @@ from flax import nnx
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-# PyTorch's 0.1, in Flax's convention; the default of 0.99 forgets too slowly here.
+# PyTorch's 0.1 in Flax's convention; Flax's default of 0.99 adapts too slowly here.
 _MOMENTUM = 0.9
 
 
 def batch_norm(channels: int, rngs: nnx.Rngs) -> nnx.BatchNorm:
-    """Batch norm in two passes: the one-pass variance cancels at large means."""
+    """Batch norm with two-pass variance: the one-pass formula cancels at large means."""
     return nnx.BatchNorm(
         channels, momentum=_MOMENTUM, epsilon=1e-5, use_fast_variance=False, rngs=rngs
     )
 
 
 class Down(nnx.Module):
-    """4x4 convolution of stride 2, batch norm, activation: half the size.
+    """4x4 convolution of stride 2, batch norm and activation; halves the resolution.
 
     References:
         PhysXNet, section 3.2, encoder layer; Isola et al., pix2pix (2017).
@@ -50,7 +50,7 @@ class Down(nnx.Module):
     def __call__(
         self, x: Float[Array, "batch height width channels"]
     ) -> Float[Array, "batch h w outputs"]:
-        """Features of half the size."""
+        """Features at half the resolution."""
         x = self.conv(x)
         if self.norm is not None:
             x = self.norm(x)
@@ -60,12 +60,12 @@ class Down(nnx.Module):
 def upsampling_kernel(
     kernel: Float[Array, "4 4 inputs outputs"],
 ) -> Float[Array, "2 2 inputs fourfold"]:
-    """The 2x2 kernel by which `upsample` is a stride-2 transposed convolution.
+    """The 2x2 kernel with which `upsample` computes a stride-2 transposed convolution.
 
     Output pixel (2i + p, 2j + q) of a 4x4 transposed convolution of stride 2 and
-    padding 1 depends on two by two inputs around (i, j), and by which taps, the parity
-    (p, q) says: along one axis parity 0 sees inputs i-1, i by taps 3, 1; parity 1 sees
-    i, i+1 by taps 2, 0.
+    padding 1 depends on 2x2 inputs around (i, j). The parity (p, q) selects the taps:
+    along one axis, parity 0 reads inputs i-1, i with taps 3, 1; parity 1 reads inputs
+    i, i+1 with taps 2, 0.
 
     Args:
         kernel: Taps of the transposed convolution.
@@ -80,11 +80,10 @@ def upsampling_kernel(
 def upsample(
     x: Float[Array, "batch height width inputs"], kernel: Float[Array, "2 2 inputs fourfold"]
 ) -> Float[Array, "batch h w outputs"]:
-    """A 4x4 transposed convolution of stride 2: twice the size.
+    """4x4 transposed convolution of stride 2; doubles the resolution.
 
-    Every window of two by two inputs answers for all four parities, and each output
-    pixel takes the one of its own: no tap is multiplied that isn't needed, but at the
-    border.
+    Each 2x2 window of inputs is evaluated for all four parities, and each output pixel
+    selects its own. Except at the border, no product is computed that isn't needed.
 
     Args:
         x: Features.
@@ -101,7 +100,7 @@ def upsample(
 
 @jax.custom_jvp
 def _windows(x: Array, kernel: Array) -> Array:
-    """What each 2x2 window of the padded features makes, those over the border too."""
+    """Convolution of every 2x2 window of the padded features, including those at the border."""
     return jax.lax.conv_general_dilated(
         x, kernel, (1, 1), ((1, 1), (1, 1)), dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
@@ -127,9 +126,9 @@ _windows.defjvp(_windows_jvp, symbolic_zeros=True)
 
 
 class Up(nnx.Module):
-    """4x4 transposed convolution of stride 2 and batch norm: twice the size.
+    """4x4 transposed convolution of stride 2 and batch norm; doubles the resolution.
 
-    Computed by `upsample`: the same linear map as the textbook's, several times faster
+    Computed by `upsample`: the same linear map as the textbook form, several times faster
     on CPUs.
 
     References:
@@ -138,7 +137,7 @@ class Up(nnx.Module):
 
     def __init__(self, inputs: int, outputs: int, *, norm: bool = True, rngs: nnx.Rngs) -> None:
         init = nnx.initializers.lecun_normal()
-        # Each output pixel sees a quarter of the taps.
+        # Factor 2, because each output pixel uses a quarter of the taps.
         kernel = 2.0 * init(rngs.params(), (4, 4, inputs, outputs), jnp.float32)
         self.kernel = nnx.Param(kernel)
         self.bias = None if norm else nnx.Param(jnp.zeros((outputs,), jnp.float32))
@@ -147,7 +146,7 @@ class Up(nnx.Module):
     def __call__(
         self, x: Float[Array, "batch height width channels"]
     ) -> Float[Array, "batch h w outputs"]:
-        """Features of twice the size."""
+        """Features at twice the resolution."""
         x = upsample(x, upsampling_kernel(self.kernel[...].astype(x.dtype)))
         if self.bias is not None:
             x = x + self.bias[...].astype(x.dtype)[None, None, None]

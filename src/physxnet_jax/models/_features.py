@@ -1,4 +1,4 @@
-"""Motion as the network sees it: texel velocities and accelerations of some frames."""
+"""Motion features of a network: texel velocities and accelerations of several frames."""
 
 import dataclasses
 from typing import Literal
@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..body import blend_rotations
+from ..body import skin_points
 from ..geometry import polar_rotation
 from ..uv import acceleration_maps, velocity_maps
 
@@ -17,18 +17,18 @@ _EXACT = jax.lax.Precision.HIGHEST
 
 
 @dataclasses.dataclass(frozen=True)
-class Inputs:
-    """Which maps of the body's motion a network sees.
+class FeatureConfig:
+    """Which maps of the body's motion are a network's inputs.
 
     Attributes:
-        family: ``paper``: in the world's frame; ``local``: in each texel's own frame,
-            the rotation nearest to its skinning.
-        frames: Frames k - (frames - 1) stride, ..., k - stride, k are seen.
-        stride: Frames from one to the next.
-        acceleration: Accelerations beside velocities.
-        gravity: The direction of gravity (``local`` only: elsewhere it is constant).
-        place: Where the texel lies from the middle of the body (``local`` only): from
-            it the pose can be told, of which velocities know nothing.
+        family: ``paper``: in the world frame; ``local``: in each texel's own frame, the
+            rotation nearest to its skinning.
+        frames: Number of input frames: k - (frames - 1) stride, ..., k - stride, k.
+        stride: Frames from one input frame to the next.
+        acceleration: Include accelerations besides velocities.
+        gravity: Include the direction of gravity (``local`` only: elsewhere it is constant).
+        position: Include the texel's position relative to the middle of the body (``local``
+            only): it encodes the pose, which velocities don't.
     """
 
     family: Family = "local"
@@ -36,7 +36,7 @@ class Inputs:
     stride: int = 1
     acceleration: bool = True
     gravity: bool = True
-    place: bool = True
+    position: bool = True
 
     def __post_init__(self) -> None:
         if self.frames < 1 or self.stride < 1:
@@ -44,44 +44,32 @@ class Inputs:
 
     @property
     def window(self) -> int:
-        """Poses needed for one answer; an acceleration reaches two frames back."""
+        """Poses needed for one prediction; an acceleration reaches two frames back."""
         return (self.frames - 1) * self.stride + 3
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of channels in their order, three or three times ``frames`` each."""
+        """Kinds of channels in order; each has three or three times ``frames`` channels."""
         local = self.family == "local"
         return (
             "velocity",
             *(["acceleration"] if self.acceleration else []),
             *(["gravity"] if self.gravity and local else []),
-            *(["place"] if self.place and local else []),
+            *(["position"] if self.position and local else []),
         )
 
     @property
     def channels(self) -> int:
-        """Channels in all: 18 for the paper's."""
+        """Total number of channels; 18 for the paper's features."""
         return sum(self.width(kind) for kind in self.kinds)
 
     def width(self, kind: str) -> int:
-        """Channels of a kind."""
+        """Number of channels of a kind."""
         return 3 * self.frames if kind in ("velocity", "acceleration") else 3
 
 
-PAPER = Inputs("paper")
-"""The paper's: velocities and accelerations of three frames in the world's frame."""
-
-
-def skin_points(
-    rest: Float[Array, "points 3"],
-    weights: Float[Array, "points joints"],
-    rotations: Float[Array, "joints 3 3"],
-    translations: Float[Array, "joints 3"],
-) -> tuple[Float[Array, "points 3"], Float[Array, "points 3 3"]]:
-    """Skinned points [m] and the linear part of their skinning."""
-    blend = blend_rotations(weights, rotations)
-    shift = jnp.matmul(weights, translations, precision=_EXACT)
-    return jnp.einsum("pab,pb->pa", blend, rest, precision=_EXACT) + shift, blend
+PAPER = FeatureConfig("paper")
+"""The paper's features: velocities and accelerations of three frames in the world frame."""
 
 
 def clip_features(
@@ -90,25 +78,25 @@ def clip_features(
     rotations: Float[Array, "padded joints 3 3"],
     translations: Float[Array, "padded joints 3"],
     fps: float,
-    inputs: Inputs,
+    inputs: FeatureConfig,
 ) -> Float[Array, "frames texels channels"]:
-    """Features of successive frames, each point skinned once.
+    """Features of successive frames; each point is skinned once per frame.
 
-    Turning the person about the vertical axis leaves ``local`` features as they are.
+    ``local`` features are invariant to rotation of the person about the vertical axis.
 
     Args:
         rest: Texel points at rest [m].
         weights: Their skinning weights.
         rotations: World rotations of joints of all frames, with ``inputs.window - 1``
-            frames before the first one wanted; repeat the first frame there at a
-            clip's start.
+            frames before the first output frame. At the start of a clip, repeat its first
+            frame there.
         translations: World translations of joints [m], likewise.
-        fps: Frames a second.
-        inputs: Which features.
+        fps: Frames per second.
+        inputs: Which features to compute.
 
     Returns:
         Features of every covered texel: velocities [m/s], oldest first, accelerations
-        [m/s^2], gravity's direction, place [m].
+        [m/s^2], direction of gravity, position [m].
 
     References:
         PhysXNet, section 3.1: X = (I_v, I_a) of frames k-2 to k.
@@ -123,15 +111,16 @@ def point_features(
     points: Float[Array, "padded texels 3"],
     blends: Float[Array, "frames texels 3 3"],
     fps: float,
-    inputs: Inputs,
+    inputs: FeatureConfig,
 ) -> Float[Array, "frames texels channels"]:
-    """`clip_features` of points that are skinned already.
+    """`clip_features` from points that are already skinned.
 
     Args:
-        points: Skinned texel points [m], ``inputs.window - 1`` frames more than wanted.
-        blends: Linear parts of the skinning of the frames wanted.
-        fps: Frames a second.
-        inputs: Which features.
+        points: Skinned texel points [m], with ``inputs.window - 1`` frames before the first
+            output frame.
+        blends: Linear parts of the skinning in the output frames.
+        fps: Frames per second.
+        inputs: Which features to compute.
     """
     lead = inputs.window - 1
     frames, texels = blends.shape[:2]
@@ -147,7 +136,7 @@ def point_features(
     out = [turned.reshape(frames, texels, -1)]
     if inputs.gravity:
         out.append(-frame[:, :, 1, :])
-    if inputs.place:
+    if inputs.position:
         away = points[lead:] - jnp.mean(points[lead:], axis=1, keepdims=True)
         out.append(jnp.einsum("fpba,fpb->fpa", frame, away, precision=_EXACT))
     return jnp.concatenate(out, axis=2)

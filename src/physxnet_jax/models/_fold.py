@@ -1,4 +1,4 @@
-"""Networks for use: batch norm folded into the convolutions, numbers of fewer bits."""
+"""Networks for inference: batch norm folded into the convolutions, selectable precision."""
 
 import dataclasses
 from typing import Any, Literal
@@ -15,7 +15,7 @@ from ._predictor import Predictor
 
 
 class _Convolution(nnx.Module):
-    """A convolution to half or twice the size, its bias, and what follows it."""
+    """A convolution to half or twice the resolution, with bias and activation."""
 
     def __init__(self, kernel: Array, bias: Array, *, slope: float | None, up: bool) -> None:
         self.kernel, self.bias = nnx.Param(kernel), nnx.Param(bias)
@@ -24,7 +24,7 @@ class _Convolution(nnx.Module):
     def __call__(
         self, x: Float[Array, "batch height width channels"]
     ) -> Float[Array, "batch h w outputs"]:
-        """Features of half or twice the size."""
+        """Features at half or twice the resolution."""
         kernel = self.kernel[...].astype(x.dtype)
         if self.up:
             x = upsample(x, kernel)
@@ -37,22 +37,20 @@ class _Convolution(nnx.Module):
 
 
 def fold_batch_norm(predictor: Predictor) -> Predictor:
-    """A predictor whose network has no batch norm left, with the same answers.
+    """Folds the batch norm of a predictor's network into its convolutions.
 
-    One that is folded already stays as it is.
+    A network that is already folded is left unchanged.
 
     The statistics are fixed outside training, so each norm is a scale and a shift of its
-    convolution's output. Kernels of upsampling are put into the form they are used in.
+    convolution's output. Upsampling kernels are converted to the form in which they are used.
     The result can be differentiated but isn't meant to be trained or saved.
 
     Args:
-        predictor: A predictor with a `Generator`, or with several that are averaged.
+        predictor: A predictor. Only a `Generator`, or an average of several, is folded; any
+            other module passes through.
 
     Returns:
-        The folded predictor; answers differ by rounding alone.
-
-    Raises:
-        TypeError: A network of other layers.
+        The folded predictor; predictions differ by rounding alone.
     """
     network = nnx.merge(predictor.graph, predictor.state, copy=True)
     for one in network.networks if isinstance(network, MeanGenerator) else (network,):
@@ -62,8 +60,9 @@ def fold_batch_norm(predictor: Predictor) -> Predictor:
 
 
 def _fold(network: Any) -> None:
+    # A custom network is used as it is.
     if not isinstance(network, Generator):
-        raise TypeError(f"a Generator is wanted, got {type(network).__name__}.")
+        return
     parts: Any = network
     for k, layer in enumerate(parts.encoder):
         parts.encoder[k] = _down(layer) if isinstance(layer, Down) else layer
@@ -77,11 +76,11 @@ def at_precision(
 ) -> Predictor:
     """A folded predictor that computes its network in another precision.
 
-    Features, and what becomes of the maps, stay as they are.
+    Features and the postprocessing of maps are unchanged.
 
     Args:
         predictor: A predictor.
-        precision: Of parameters and arithmetic. ``float64`` needs ``jax_enable_x64``.
+        precision: Type of parameters and arithmetic. ``float64`` needs ``jax_enable_x64``.
 
     Returns:
         The predictor; batch norm is folded before rounding.
@@ -121,7 +120,7 @@ def _folded(
     epsilon: float,
     up: bool = False,
 ) -> tuple[Float[Array, "2 2 inputs fourfold"] | Float[Array, "4 4 inputs c"], Float[Array, " c"]]:
-    """Kernel and bias that stand for a convolution and the norm after it."""
+    """Kernel and bias equivalent to a convolution and the norm after it."""
     shift = jnp.zeros(kernel.shape[-1:], kernel.dtype) if bias is None else bias
     var, mean, gain, offset = norm
     if var is not None and mean is not None:

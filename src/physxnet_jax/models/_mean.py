@@ -1,4 +1,4 @@
-"""Several networks asked as one: the mean of what they answer."""
+"""Averages of networks: the mean of their predictions."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -22,50 +22,50 @@ class MeanGenerator(nnx.Module):
     def __call__(
         self, x: Float[Array, "batch height width channels"], templates: Sequence[str]
     ) -> dict[str, Float[Array, "batch height width 3"]]:
-        """Normalised offset maps of the templates asked for."""
-        answers = [network(x, templates) for network in self.networks]
-        share = 1.0 / len(answers)
-        return {t: share * sum((a[t] for a in answers[1:]), answers[0][t]) for t in templates}
+        """Normalised offset maps of the requested templates."""
+        outputs = [network(x, templates) for network in self.networks]
+        share = 1.0 / len(outputs)
+        return {t: share * sum((a[t] for a in outputs[1:]), outputs[0][t]) for t in templates}
 
 
 def average_networks(predictors: Sequence[Predictor]) -> Predictor:
-    """A predictor that asks several networks and averages their answers.
+    """A predictor that averages the predictions of several networks.
 
-    Networks that learned the same in different ways err in part in different directions.
-    As many times one network's work as there are networks; the result is for answers,
-    not for training or saving.
+    Networks trained differently on the same task have partly independent errors. The cost
+    is that of all networks together. The result is for inference, not for training or
+    saving.
 
     Args:
-        predictors: Predictors with a `Generator` each, of one configuration, that see
-            motion at the same scales. Offsets may be scaled differently.
+        predictors: Predictors with a `Generator` each, of one configuration and with the same
+            scales of inputs. Scales of offsets may differ.
 
     Raises:
-        ValueError: None, or predictors that don't see and answer the same.
+        ValueError: No predictors, or predictors with different inputs or outputs.
     """
     if not predictors:
         raise ValueError("no predictors to average.")
     first = predictors[0]
-    seen = first.normalisation
+    reference = first.normalisation
     networks = []
     for p in predictors:
-        scales = [(seen.velocity, p.normalisation.velocity)]
-        scales.append((seen.acceleration, p.normalisation.acceleration))
-        alike = all(np.isclose(float(a), float(b), rtol=1e-4) for a, b in scales)
-        alike &= all(
-            np.array_equal(p.surface.valid[t], first.surface.valid[t])
+        scales = [(reference.velocity, p.normalisation.velocity)]
+        scales.append((reference.acceleration, p.normalisation.acceleration))
+        compatible = all(np.isclose(float(a), float(b), rtol=1e-4) for a, b in scales)
+        compatible &= all(
+            np.array_equal(p.texel_points.valid[t], first.texel_points.valid[t])
             for t in first.config.templates
             if p.config == first.config
         )
-        ways = (p.mirrored, p.relaxation) == (first.mirrored, first.relaxation)
-        if p.config != first.config or not ways or not alike:
+        compatible &= p.mirror_tta == first.mirror_tta
+        if p.config != first.config or not compatible:
             raise ValueError(
-                "networks of different configurations, input scales, texels or relaxation."
+                "networks of different configurations, input scales, texels or augmentation."
             )
         network = nnx.merge(p.graph, p.state, copy=True)
         if not isinstance(network, Generator):
-            raise ValueError(f"a Generator is wanted, got {type(network).__name__}.")
+            raise ValueError(f"expected a Generator, got {type(network).__name__}.")
         for t in first.config.templates:
-            _scale_answer(network, t, p.normalisation.offset[t] / seen.offset[t])
+            _scale_output(network, t, p.normalisation.offset[t] / reference.offset[t])
         networks.append(network)
     mean = MeanGenerator(networks)
     mean.eval()
@@ -73,9 +73,9 @@ def average_networks(predictors: Sequence[Predictor]) -> Predictor:
     return dataclasses.replace(first, graph=graph, state=state)
 
 
-def _scale_answer(network: Generator, template: str, factor: Float[Array, ""]) -> None:
+def _scale_output(network: Generator, template: str, factor: Float[Array, ""]) -> None:
     last = network.decoders[template].layers[-1]
     if not isinstance(last, Up) or last.bias is None:
-        raise ValueError("networks are averaged before their batch norm is folded.")
+        raise ValueError("average networks before their batch norm is folded.")
     last.kernel[...] = last.kernel[...] * factor
     last.bias[...] = last.bias[...] * jnp.broadcast_to(factor, last.bias[...].shape)

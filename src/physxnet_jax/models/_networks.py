@@ -1,4 +1,4 @@
-"""The generator (one encoder, a decoder a template) and the PatchGAN discriminator."""
+"""The generator (one encoder, one decoder per template) and the PatchGAN discriminator."""
 
 import itertools
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ LEVELS = 4
 
 
 class Decoder(nnx.Module):
-    """Four upsampling layers with skips from the encoder, ending in an offset map."""
+    """Four upsampling layers with skip connections from the encoder, ending in an offset map."""
 
     def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
         deep = [width * 2**k for k in range(LEVELS)]
@@ -40,15 +40,15 @@ class Decoder(nnx.Module):
 
 
 class Generator(nnx.Module):
-    """G: maps of body motion to maps of garment offsets.
+    """G, from maps of body motion to maps of garment offsets.
 
-    Only the decoders asked for are computed.
+    Only the requested decoders are computed.
 
     Args:
         channels: Input channels (18 for `paper`, 24 for `local`).
-        templates: Templates to have a decoder for.
+        templates: Templates that get a decoder.
         width: Channels of the first layer; doubled at each of four levels.
-        rngs: Randomness for the parameters.
+        rngs: Random streams for the initial parameters.
 
     Example:
         >>> g = Generator(18, ("top",), width=4, rngs=nnx.Rngs(0))
@@ -71,10 +71,10 @@ class Generator(nnx.Module):
         x: Float[Array, "batch height width channels"],
         templates: Sequence[str],
     ) -> dict[str, Float[Array, "batch height width 3"]]:
-        """Normalised offset maps of the templates asked for.
+        """Normalised offset maps of the requested templates.
 
         Raises:
-            ValueError: A size that four halvings don't divide.
+            ValueError: A size that isn't a multiple of 16.
         """
         if x.shape[1] % 2**LEVELS or x.shape[2] % 2**LEVELS:
             raise ValueError(
@@ -89,10 +89,10 @@ class Generator(nnx.Module):
 
 
 class Discriminator(nnx.Module):
-    """D: a PatchGAN that judges offset maps given the motion maps.
+    """D, a PatchGAN that classifies offset maps given the motion maps.
 
-    Returns logits; each judges a patch of 46 texels (the receptive field
-    of three strided layers and the head).
+    Returns logits, one for each patch of 46 texels (the receptive field of three strided
+    layers and the head).
 
     References:
         Isola et al., pix2pix (2017), section 3.2.2.
@@ -113,7 +113,7 @@ class Discriminator(nnx.Module):
         condition: Float[Array, "batch height width channels"],
         maps: Float[Array, "batch height width offsets"],
     ) -> Float[Array, "batch h w 1"]:
-        """Logits of being real, one a patch."""
+        """Logits of being real, one per patch."""
         x = jnp.concatenate([condition, maps], axis=-1)
         for layer in self.layers:
             x = layer(x)

@@ -1,13 +1,10 @@
 """Motion of the body: files, retargeting, resampling and built-in clips."""
 
-from ._amass import amass_clip as amass_clip
 from ._asf_amc import read_amc as read_amc
 from ._bvh import read_bvh as read_bvh
-from ._drive import drive as drive
 from ._faults import sudden_turns as sudden_turns
-from ._follow import follow_surface as follow_surface
+from ._fit_motion import fit_motion as fit_motion
 from ._gltf import read_gltf as read_gltf
-from ._gltf_file import GLTF_FORMATS as GLTF_FORMATS, GltfFile as GltfFile
 from ._inspect import MotionInspection as MotionInspection, inspect_motion as inspect_motion
 from ._load import load_motion as load_motion, save_motion as save_motion
 from ._motion import (
@@ -17,31 +14,27 @@ from ._motion import (
     make_motion as make_motion,
     resample as resample,
     sample as sample,
-    slerp as slerp,
 )
+from ._prepare import prepare_motion as prepare_motion, slice_motion as slice_motion
 from ._procedural import CLIPS as CLIPS, procedural_clip as procedural_clip
 from ._retarget import (
     foot_heights as foot_heights,
     retarget as retarget,
     stand_on_floor as stand_on_floor,
 )
+from ._retarget_to_rig import retarget_to_rig as retarget_to_rig
 from ._skeletons import (
     JOINT_MAPS as JOINT_MAPS,
     LIMBS as LIMBS,
     find_joint_map as find_joint_map,
     read_joint_map as read_joint_map,
 )
-from ._source import (
-    MAX_JOINT_FRAMES as MAX_JOINT_FRAMES,
-    SourceClip as SourceClip,
-    nominal_rate as nominal_rate,
-)
 from ._transforms import (
     BLOCK as BLOCK,
-    before_transforms as before_transforms,
     clip_transforms as clip_transforms,
+    extrapolate_history as extrapolate_history,
+    history_transforms as history_transforms,
     padded_block as padded_block,
-    poses_before as poses_before,
 )
 from ._variants import (
     at_speed as at_speed,

@@ -1,4 +1,4 @@
-"""Motion in the layout of AMASS: poses of the SMPL family, without any of its models."""
+"""Reader of AMASS clips: poses of the SMPL family, read without an SMPL model."""
 
 import dataclasses
 import pathlib
@@ -20,16 +20,16 @@ AMASS_ARRAYS = (
     "mocap_frame_rate",
     "fps",
 )
-"""Arrays that are read; shapes, genders and soft tissues are not."""
+"""Arrays that are read; shape, gender and soft-tissue arrays are not."""
 
-# A rotation vector longer than this is no pose [rad].
-_MOST_TURN = 1e6
+# Rotation vectors with a component beyond this are rejected [rad].
+_MAX_ROTATION = 1e6
 
-# Whose lowest joint ends so far along one axis, and hardly elsewhere along another, went
-# along the one over a floor across the other [m].
+# The person travels along Y over a floor normal to Z if the lowest joint moves farther than
+# _TRAVELLED along Y and less than _LEVEL along Z [m].
 _TRAVELLED, _LEVEL = 0.3, 0.1
 
-# Joint, its parent, and where it is from there on a person of ordinary build [m].
+# Joint, its parent, and its offset from the parent on a person of average build [m].
 _FIGURE: tuple[tuple[str, str | None, tuple[float, float, float]], ...] = (
     ("pelvis", None, (0.0, 0.0, 0.0)),
     ("left_hip", "pelvis", (0.07, -0.09, 0.0)),
@@ -63,19 +63,19 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
         arrays: `trans` [frames, 3] in metres; `poses` [frames, 66 or more], axis-angle,
             the first 22 joints as SMPL orders them, or `root_orient` [frames, 3] and
             `pose_body` [frames, 63]; `mocap_framerate`, `mocap_frame_rate` or `fps`.
-        path: Where they are from, for errors and the name.
+        path: The file of the arrays, for error messages and the clip's name.
 
     Returns:
-        The clip on a figure of ordinary build that stands in a T-pose at rest, Y up.
+        The clip on a skeleton of average build whose rest pose is a T-pose, Y up.
 
     Raises:
-        MotionError: Arrays missing, of other shapes, or not finite.
+        MotionError: Arrays are missing, have other shapes, or aren't finite.
 
     Note:
-        Shape parameters are ignored, as no SMPL model is at hand to read them. A body
-        of that family leans its limbs a few degrees from an exact T-pose at rest; limbs
-        are off by as much. Z is up, unless the person stands
-        along Y on average and doesn't go that way over a floor along Z.
+        Shape parameters are ignored, since they need an SMPL model. At rest, the limbs of
+        SMPL bodies differ from an exact T-pose by a few degrees, and the clip's limbs are
+        off by as much. Z is up unless the person stands along Y on average and doesn't
+        travel along Y over a floor normal to Z.
 
     References:
         Mahmood et al., AMASS: Archive of Motion Capture as Surface Shapes (2019).
@@ -89,25 +89,25 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
             raise _broken(path, f"root_orient {parts[0].dtype}, pose_body {parts[1].dtype}")
         poses = np.concatenate(parts, axis=1)
     if poses is None:
-        raise _broken(path, "it has trans, but no poses")
+        raise _broken(path, "trans without poses")
     trans = arrays["trans"]
     joints = len(_FIGURE)
     if poses.ndim != 2 or poses.shape[1] < 3 * joints or trans.shape != (len(poses), 3):
         raise _broken(path, f"poses {poses.shape}, trans {trans.shape}")
     if len(poses) == 0:
-        raise _broken(path, "no frame")
+        raise _broken(path, "no frames")
     if len(poses) * joints > MAX_JOINT_FRAMES:
-        raise _broken(path, f"{len(poses):,} frames: cut the clip")
+        raise _broken(path, f"{len(poses):,} frames are too many, cut the clip")
     if not (is_real(poses) and is_real(trans)):
         raise _broken(path, f"poses are {poses.dtype}, trans {trans.dtype}")
     turns = poses[:, : 3 * joints].astype(np.float64)
     place = trans.astype(np.float64)
-    bad = ~((np.abs(turns) < _MOST_TURN).all(axis=1) & np.isfinite(place).all(axis=1))
+    bad = ~((np.abs(turns) < _MAX_ROTATION).all(axis=1) & np.isfinite(place).all(axis=1))
     if bad.any():
         raise MotionError.at(
             path,
             None,
-            f"frame {int(np.argmax(bad))} is not finite, or no pose",
+            f"frame {int(np.argmax(bad))} is not finite or out of range",
             "Cut the frame out or interpolate over it",
         )
     names = tuple(name for name, _, _ in _FIGURE)
@@ -128,13 +128,13 @@ def amass_clip(arrays: Mapping[str, np.ndarray], path: pathlib.Path) -> SourceCl
     )
     if not _z_is_up(clip):
         return clip
-    # The figure at rest has Y up already.
+    # The rest pose of the skeleton already has Y up.
     turn = Rotation.from_euler("X", -90, degrees=True).as_matrix()
     return dataclasses.replace(clip, rotations=turn @ world, root=place @ turn.T)
 
 
 def _z_is_up(clip: SourceClip) -> bool:
-    """Whether the person stands along Z on average, or crawls along Y."""
+    """Whether Z is up: the person stands along Z on average, or travels along Y."""
     up = clip.rotations[:, 0, :, 1].mean(axis=0)
     if up[2] > up[1]:
         return True
@@ -168,7 +168,7 @@ def _broken(path: pathlib.Path, problem: str) -> MotionError:
     return MotionError.at(
         path,
         None,
-        f"not a clip of AMASS: {problem}",
+        f"not an AMASS clip: {problem}",
         f"Expected poses [frames, {3 * len(_FIGURE)} or more], trans [frames, 3] and"
         " mocap_framerate",
     )

@@ -1,4 +1,4 @@
-"""Reader of Acclaim skeleton and motion files (ASF/AMC), the CMU originals."""
+"""Reader of Acclaim skeleton and motion files (ASF/AMC), CMU's original format."""
 
 import dataclasses
 import pathlib
@@ -28,10 +28,10 @@ class _Bone:
 
 
 def find_skeleton(path: pathlib.Path) -> pathlib.Path:
-    """The ASF that belongs to an AMC: same subject number or same name, beside it.
+    """Finds the ASF of an AMC in its folder, by name or subject number, or as the only one.
 
     Raises:
-        MotionError: If there is none, or no way to tell.
+        MotionError: No ASF matches, and the folder doesn't hold exactly one.
     """
     stems = [path.stem, path.stem.split("_")[0], re.sub(r"\d+$", "", path.stem)]
     for stem in stems:
@@ -46,24 +46,24 @@ def find_skeleton(path: pathlib.Path) -> pathlib.Path:
         path,
         None,
         f"no skeleton: looked for {', '.join(sorted({s + '.asf' for s in stems if s}))}",
-        "Put the subject's ASF beside it or name it (--skeleton FILE, skeleton=…)",
+        "Put the subject's ASF into its folder or pass it (--skeleton FILE, skeleton=…)",
     )
 
 
 def read_amc(path: str | pathlib.Path, skeleton: str | pathlib.Path | None = None) -> SourceClip:
-    """An AMC file with its ASF skeleton, before retargeting.
+    """Reads an AMC file with its ASF skeleton, without retargeting.
 
     Args:
         path: The AMC.
-        skeleton: The ASF; found beside the AMC if omitted (see `find_skeleton`).
+        skeleton: The ASF; looked up in the AMC's folder if omitted (see `find_skeleton`).
 
     Returns:
-        One joint a bone, at the bone's start; world rotations of the bones.
+        One joint per bone, at the bone's start, with the bone's world rotation.
 
     Raises:
         MotionError: Malformed, truncated, empty or binary files, bones that the
-            skeleton doesn't have, wrong numbers of values. File, line and fix are
-            named.
+            skeleton lacks, or wrong numbers of values. The message names file, line
+            and fix.
 
     References:
         Lander, Working with Motion Capture File Formats (1998): the axis convention.
@@ -94,7 +94,7 @@ def read_amc(path: str | pathlib.Path, skeleton: str | pathlib.Path | None = Non
         raise MotionError.at(
             path,
             None,
-            f"{count:,} frames of {len(names):,} bones",
+            f"{count:,} frames of {len(names):,} bones are too many",
             "Cut the clip into shorter files",
         )
     world = np.zeros((count, len(names), 3, 3))
@@ -201,7 +201,7 @@ def _read_frames(
     path: pathlib.Path, lines: list[str], bones: dict[str, _Bone]
 ) -> dict[str, np.ndarray]:
     moving = [name for name, bone in bones.items() if bone.dof]
-    # Lines of each: read twice, they needn't be held as words.
+    # Line numbers per bone: splitting the lines twice avoids holding all words in memory.
     rows: dict[str, list[int]] = {name: [] for name in moving}
     frame = 0
     first: int | None = None
@@ -235,7 +235,7 @@ def _read_frames(
                 path,
                 n,
                 f"unknown bone '{words[0][:40]}'",
-                "The skeleton belongs to another file: name the right ASF",
+                "The skeleton belongs to another file: pass the right ASF",
             )
         if len(words) - 1 != len(bones[name].dof):
             raise MotionError.at(
@@ -243,13 +243,13 @@ def _read_frames(
                 n,
                 f"{len(words) - 1} values for '{name}', the skeleton has"
                 f" {len(bones[name].dof)} channels",
-                "The line is damaged, or the ASF is another subject's",
+                "The line is damaged, or the ASF belongs to another subject",
             )
         rows[name].append(n)
         if len(rows[name]) > frame:
             raise MotionError.at(path, n, f"'{name}' twice in frame {frame}", "Repair it")
     if frame == 0:
-        raise MotionError.at(path, len(lines), "no frame in the file", "Export it again")
+        raise MotionError.at(path, len(lines), "no frames in the file", "Export it again")
     _check_complete(path, len(lines), rows, frame)
     return {
         name: table(path, lines, where, 1, len(bones[name].dof))
@@ -259,7 +259,7 @@ def _read_frames(
 
 
 def _check_complete(path: pathlib.Path, n: int, rows: dict[str, list[int]], frame: int) -> None:
-    """Every bone that moved in the first frame must be in each frame."""
+    """Raises unless every frame so far has the root and each bone that has any values."""
     for name, values in rows.items():
         if len(values) != frame and (values or name == "root"):
             raise MotionError.at(

@@ -7,19 +7,20 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
-from ._source import MAX_JOINT_FRAMES, SourceClip, nominal_rate
+from ..io import nominal_rate
+from ._source import MAX_JOINT_FRAMES, SourceClip
 from ._text import is_count, numbers, read_lines, table
 
 _AXES = {"Xrotation": "X", "Yrotation": "Y", "Zrotation": "Z"}
-_SLOTS = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
+_POSITIONS = {"Xposition": 0, "Yposition": 1, "Zposition": 2}
 _MAX_DEPTH = 200
 
 
 def read_bvh(path: str | pathlib.Path) -> SourceClip:
-    """A BVH file as it is, before retargeting.
+    """Reads a BVH file, without retargeting.
 
-    Of several skeletons in a file the one of most joints is read, the first of such. A name
-    that comes again in a skeleton gets a number: ``Hand``, ``Hand_2``.
+    If a file has several skeletons, the one with the most joints is read; of several such, the
+    first. Repeated names within a skeleton are numbered: ``Hand``, ``Hand_2``.
 
     Args:
         path: The file.
@@ -29,8 +30,8 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
 
     Raises:
         MotionError: Malformed, truncated, empty or binary files, wrong numbers of
-            channels or values, values that aren't finite. File, line and fix are
-            named.
+            channels or values, or values that aren't finite. The message names file,
+            line and fix.
 
     References:
         Meredith and Maddock, Motion Capture File Formats Explained (2001).
@@ -47,12 +48,12 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
         raise MotionError.at(
             path,
             None,
-            f"{len(values):,} frames of {len(names):,} joints",
+            f"{len(values):,} frames of {len(names):,} joints are too many",
             "Cut the clip into shorter files",
         )
     root = np.tile(offsets[0], (len(values), 1))
     world = np.zeros((len(values), len(names), 3, 3))
-    moves = any(c in _SLOTS for chans in channels[1:] for c in chans)
+    moves = any(c in _POSITIONS for chans in channels[1:] for c in chans)
     shifts = np.tile(offsets, (len(values), 1, 1)) if moves else None
     at = 0
     for j, chans in enumerate(channels):
@@ -66,10 +67,10 @@ def read_bvh(path: str | pathlib.Path) -> SourceClip:
             else np.broadcast_to(np.eye(3), (len(values), 3, 3))
         )
         for k, c in enumerate(chans):
-            if c in _SLOTS and j == 0:
-                root[:, _SLOTS[c]] = block[:, k]
-            elif c in _SLOTS and shifts is not None:
-                shifts[:, j, _SLOTS[c]] = block[:, k]
+            if c in _POSITIONS and j == 0:
+                root[:, _POSITIONS[c]] = block[:, k]
+            elif c in _POSITIONS and shifts is not None:
+                shifts[:, j, _POSITIONS[c]] = block[:, k]
         world[:, j] = local if parents[j] < 0 else world[:, parents[j]] @ local
     return SourceClip(
         tuple(names),
@@ -97,7 +98,7 @@ def _largest_tree(
             root[j] = root[parent]
     keep = np.flatnonzero(root == np.bincount(root).argmax())
     owner = np.repeat(np.arange(len(names)), [len(c) for c in channels])
-    # A skeleton is written in one piece.
+    # The joints of a skeleton are contiguous in the file.
     parents = [parents[j] - int(keep[0]) if parents[j] >= 0 else -1 for j in keep]
     return (
         [names[j] for j in keep],
@@ -158,7 +159,7 @@ def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
             pending = end_site = False
         elif key == "}":
             if not stack:
-                raise MotionError.at(path, n, "a '}' too many", "Check the hierarchy")
+                raise MotionError.at(path, n, "an unmatched '}'", "Check the hierarchy")
             stack.pop()
         elif key == "OFFSET":
             xyz = numbers(path, n, words[1:])
@@ -182,7 +183,7 @@ def _read_hierarchy(path: pathlib.Path, lines: list[str]) -> tuple[tuple, int]:
             return joints, n
         else:
             raise MotionError.at(
-                path, n, f"unknown word '{key[:40]}' in the hierarchy", "Export again"
+                path, n, f"unknown keyword '{key[:40]}' in the hierarchy", "Export again"
             )
     raise MotionError.at(
         path, len(lines), "the file ends before MOTION", "It is truncated: export again"
@@ -203,11 +204,11 @@ def _add_channels(
         raise MotionError.at(
             path,
             n,
-            f"CHANNELS says {words[1] if len(words) > 1 else 'nothing'} but lists"
+            f"CHANNELS declares {words[1] if len(words) > 1 else 'nothing'} but lists"
             f" {len(names)} names",
             "Make the number match the list",
         )
-    unknown = [c for c in names if c not in _AXES and c not in _SLOTS]
+    unknown = [c for c in names if c not in _AXES and c not in _POSITIONS]
     if unknown or len(set(names)) != len(names):
         raise MotionError.at(
             path,
@@ -244,14 +245,14 @@ def _read_motion(
         raise MotionError.at(
             path,
             rows[int(count[0])][0],
-            f"more lines than the {count[0]} frames announced",
+            f"more lines than the {count[0]} frames declared",
             "Correct 'Frames:'",
         )
     if len(rows) < int(count[0]):
         raise MotionError.at(
             path,
             len(lines),
-            f"{len(rows)} frames of the {count[0]} announced",
+            f"{len(rows)} frames of the {count[0]} declared",
             "The file is truncated: export again, or correct 'Frames:'",
         )
     for n, row in rows:
@@ -270,7 +271,7 @@ def _read_motion(
         raise MotionError.at(
             path,
             body[1][0],
-            f"a Frame Time of {step[0]} means {fps:.3g} frames a second",
+            f"a Frame Time of {step[0]} means {fps:.3g} frames per second",
             "Write it in seconds: 0.00833333 for 120 fps",
         )
     return values, nominal_rate(fps)

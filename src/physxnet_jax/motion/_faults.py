@@ -1,24 +1,25 @@
-"""What is wrong with a motion that clothes will show."""
+"""Detection of motion faults that affect the clothes."""
 
 import numpy as np
 
 from ..body import Body
 from ._motion import Motion
 
-# Limbs don't turn faster than this between frames [degrees], at 30 of them a second or more.
-_FASTEST = 60.0
+# Largest plausible turn of a limb from frame to frame [degrees], at 30 fps or more.
+_MAX_TURN = 60.0
 _JOINTS = ("Hips", "Spine", "UpLeg", "Leg", "Arm", "ForeArm")
 
 
 def sudden_turns(body: Body, motion: Motion) -> str | None:
-    """A sentence about limbs that turn over within a frame, as captured motion may have it.
+    """Reports limbs that turn over within a frame, as can happen in captured motion.
 
     Args:
         body: The body.
         motion: The motion.
 
     Returns:
-        Which joint, where and how often; None if nothing turns faster than people do.
+        A sentence with the joint, the frame and the number of affected frames; None if no
+        joint turns faster than a person can.
     """
     q = np.asarray(motion.rotations, np.float64)
     if len(q) < 2:
@@ -31,15 +32,15 @@ def sudden_turns(body: Body, motion: Motion) -> str | None:
     lengths = np.linalg.norm(q[:, rows], axis=2)
     cosine = np.clip(dots / np.maximum(lengths[1:] * lengths[:-1], 1e-12), 0.0, 1.0)
     degrees = np.degrees(2.0 * np.arccos(cosine))
-    sudden = degrees > _FASTEST * max(1.0, 30.0 / motion.fps)
+    sudden = degrees > _MAX_TURN * max(1.0, 30.0 / motion.fps)
     if not sudden.any():
         return None
     frame, which = np.unravel_index(int(degrees.argmax()), degrees.shape)
     more = int(sudden.any(axis=1).sum()) - 1
-    others = f", and {more} other frames are alike" if more > 1 else ""
-    others = ", and another frame is alike" if more == 1 else others
+    others = f", and {more} other frames are affected" if more > 1 else ""
+    others = ", and another frame is affected" if more == 1 else others
     return (
         f"{motion.name or 'the motion'}: {names[rows[which]]} turns by {degrees[frame, which]:.0f}"
-        f" degrees from frame {frame} to {frame + 1}{others}: nobody moves like that, and clothes"
-        " will be thrown about there."
+        f" degrees from frame {frame} to {frame + 1}{others}: no limb turns that"
+        " fast, and the clothes will be flung about there."
     )

@@ -1,4 +1,4 @@
-"""Reader of glTF skeletons and animations: the joints of a skin, or all that turns."""
+"""Reader of glTF skeletons and animations: the joints of a skin, or all rotating nodes."""
 
 import pathlib
 
@@ -6,24 +6,24 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import MotionError, PhysXNetError
-from ._gltf_file import GltfFile, nearest_turns
+from ..io import GltfFile, nearest_turns
 from ._source import SourceClip
 
 
 def read_gltf(path: str | pathlib.Path) -> SourceClip:
-    """The first animation of a `.glb` or `.gltf` file, before retargeting.
+    """Reads the first animation of a `.glb` or `.gltf` file, without retargeting.
 
     Args:
         path: The file.
 
     Returns:
         World rotations and positions of the joints of the largest skin, or of every node
-        that is animated if there is no skin. The nodes as they stand in the file are the
-        rest pose. What VRM calls a bone of the body has that name.
+        with an animated rotation if there is no skin. The static node transforms are the
+        rest pose. Joints that VRM declares as humanoid bones take their VRM names.
 
     Raises:
-        MotionError: Damaged files, files without an animation, a skeleton scaled to
-            nothing. No file outside the folder is opened and nothing is downloaded.
+        MotionError: Damaged files, files without an animation, or a skeleton with zero
+            scale. No file outside the folder is opened, and nothing is downloaded.
         MissingDependencyError: Without pygltflib.
 
     References:
@@ -33,7 +33,7 @@ def read_gltf(path: str | pathlib.Path) -> SourceClip:
         return _read(pathlib.Path(path))
     except (PhysXNetError, OSError):
         raise
-    # The library hands on whatever kinds of values the JSON has.
+    # pygltflib doesn't check the types of the JSON's values.
     except (TypeError, ValueError, AttributeError, LookupError, OverflowError) as error:
         raise MotionError.at(
             path,
@@ -51,10 +51,10 @@ def _read(path: pathlib.Path) -> SourceClip:
 
 
 def read_rig(file: GltfFile) -> tuple[SourceClip, list[int]]:
-    """The skeleton of a file as it stands, as a clip of one frame, and its joints' nodes.
+    """Reads a file's static skeleton as a one-frame clip, with the node of each joint.
 
     Raises:
-        MotionError: No skeleton, or one scaled to nothing.
+        MotionError: No skeleton, or one with zero scale.
     """
     nodes = skeleton_nodes(file)
     return _clip(file, nodes, file.world()[:, nodes], 30.0), nodes
@@ -70,14 +70,14 @@ def _clip(
         own = str(file.document.nodes[n].name or f"node{n}").split(":")[-1]
         names.append(bones.get(n, f"{own} (node {n})" if own in taken else own))
     if len(set(names)) < len(names):
-        raise MotionError.at(file.path, None, "two joints of one name", "Rename one")
+        raise MotionError.at(file.path, None, "two joints have the same name", "Rename one")
     parents = skeleton_parents(file, nodes)
-    still = file.world()[:, nodes]
-    rotations, rest = _turns(file, moving), _turns(file, still)[0]
+    static = file.world()[:, nodes]
+    rotations, rest = _turns(file, moving), _turns(file, static)[0]
     return SourceClip(
         tuple(names),
         tuple(parents),
-        _in_parents(rest[None], still[:, :, :3, 3], parents)[0],
+        _in_parents(rest[None], static[:, :, :3, 3], parents)[0],
         rotations,
         moving[:, 0, :3, 3],
         fps,
@@ -89,7 +89,7 @@ def _clip(
 
 
 def skeleton_nodes(file: GltfFile) -> list[int]:
-    """Nodes of the largest skin's joints and of VRM's bones, or all that turn; parents first."""
+    """Joints of the largest skin and VRM bones, or all rotating nodes; parents first."""
     document = file.document
     if document.skins:
         most = max(document.skins, key=lambda skin: len(skin.joints))
@@ -108,7 +108,7 @@ def skeleton_nodes(file: GltfFile) -> list[int]:
 
 
 def skeleton_parents(file: GltfFile, nodes: list[int]) -> list[int]:
-    """Nearest joint above each; the first one for those that hang elsewhere."""
+    """Nearest ancestor among the joints; the first joint for those without one."""
     place = {n: k for k, n in enumerate(nodes)}
     out = []
     for k, n in enumerate(nodes):
@@ -122,7 +122,7 @@ def skeleton_parents(file: GltfFile, nodes: list[int]) -> list[int]:
 def _turns(
     file: GltfFile, matrices: Float[np.ndarray, "frames joints 4 4"]
 ) -> Float[np.ndarray, "frames joints 3 3"]:
-    """Rotations nearest to the matrices, which may scale."""
+    """Rotations nearest to matrices that may include scale."""
     try:
         return nearest_turns(matrices[:, :, :3, :3])
     except ValueError as error:

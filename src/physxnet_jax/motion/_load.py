@@ -1,4 +1,4 @@
-"""One door for every motion: a file of a known format or a built-in clip."""
+"""Loading of motions: files of all supported formats, and built-in clips."""
 
 import dataclasses
 import math
@@ -10,12 +10,12 @@ from jaxtyping import Array, Float
 
 from ..body import Body, load_body
 from ..errors import MotionError
-from ..files import is_file, read_arrays, whole_file
+from ..files import atomic_write, is_file, read_arrays
+from ..io import GLTF_FORMATS
 from ._amass import AMASS_ARRAYS, amass_clip
 from ._asf_amc import read_amc
 from ._bvh import read_bvh
 from ._gltf import read_gltf
-from ._gltf_file import GLTF_FORMATS
 from ._motion import Motion, make_motion, resample
 from ._procedural import CLIPS, procedural_clip
 from ._retarget import retarget, stand_on_floor
@@ -33,21 +33,22 @@ def load_motion(
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
 ) -> Motion:
-    """A motion by file or by name.
+    """Loads a motion from a file, or a built-in clip by name.
 
     Args:
         motion: A file or the name of a built-in clip. Files are `.bvh`, `.amc` (with its
-            ASF), `.glb`, `.gltf` or `.vrma` with an animation, and `.npz`: one that
-            `save_motion` wrote, or one of AMASS (SMPL, SMPL+H or SMPL-X poses).
+            ASF), `.glb`, `.gltf` or `.vrma` with an animation, and `.npz` written by
+            `save_motion` or from AMASS (SMPL, SMPL+H or SMPL-X poses).
         fps: Resample to this rate [1/s].
-        source_fps: True rate of the file, where its header is wrong or silent (CMU
-            subjects 60 and 61 say 120 and are 60).
+        source_fps: True rate of the file [1/s], if its header is wrong or has none (files
+            of CMU's subjects 60 and 61 declare 120 and have 60).
         skeleton: The ASF of an AMC file.
-        joint_map: Body joint to the file's joint, for a skeleton of unknown names, or
-            a file of them (`read_joint_map`).
+        joint_map: Body joint to the file's joint, for a skeleton with unknown names, or
+            a TOML file of such pairs (`read_joint_map`).
         body: Body to retarget to; the built-in one by default.
-        shape: Its shape parameters, whose proportions set how it stands and steps; what
-            `save_motion` wrote is stood on the floor, its steps stay as they are.
+        shape: Its shape parameters. The body's proportions set its height above the floor
+            and the length of its steps. A clip from `save_motion` is moved to the floor
+            but its steps aren't scaled.
 
     Returns:
         The motion on the body's skeleton.
@@ -73,12 +74,12 @@ def fitted_motion(
     joint_map: Mapping[str, str] | str | pathlib.Path | None = None,
     shape: Float[Array, " shapes"] | None = None,
 ) -> Motion:
-    """What was read, on the body's skeleton."""
+    """Retargets the result of `read_motion` to the body's skeleton, if necessary."""
     if isinstance(read, Motion):
         if joint_map is not None:
             raise MotionError(
-                f"joint_map is for skeletons of other names; '{read.name}' has the body's. Leave"
-                " it out."
+                f"joint_map is for skeletons with other names; '{read.name}' has the body's."
+                " Leave it out."
             )
         if shape is None:
             return read
@@ -98,10 +99,10 @@ def read_motion(
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
 ) -> SourceClip | Motion:
-    """A motion as its file has it, or already on the body's skeleton where it comes so.
+    """Reads a motion without retargeting; a `Motion` if it is on the body's skeleton already.
 
     Args:
-        motion: As `load_motion` takes it.
+        motion: As for `load_motion`.
         fps: Rate at which a built-in clip is computed [1/s].
         source_fps: True rate of the file.
         skeleton: The ASF of an AMC file.
@@ -131,7 +132,9 @@ def read_motion(
             )
         return procedural_clip(str(motion), fps=float(fps or 30), body=body, shape=shape)
     elif suffix == ".fbx":
-        raise MotionError.at(path, None, "FBX isn't read", "Export BVH or glTF, from Blender say")
+        raise MotionError.at(
+            path, None, "FBX isn't supported", "Export BVH or glTF, for example from Blender"
+        )
     else:
         raise MotionError(
             f"{motion}: neither a .bvh, .amc, .glb, .gltf, .vrma or .npz file nor a built-in clip"
@@ -142,7 +145,7 @@ def read_motion(
 
 def save_motion(path: str | pathlib.Path, motion: Motion) -> None:
     """Writes a motion as `.npz` (rotations, root, fps), atomically."""
-    with whole_file(path) as part, part.open("wb") as file:
+    with atomic_write(path) as part, part.open("wb") as file:
         np.savez_compressed(
             file,
             rotations=np.asarray(motion.rotations),
@@ -179,5 +182,5 @@ def _not_motion(path: pathlib.Path, problem: str) -> MotionError:
         None,
         f"not a motion archive ({problem[:200]})",
         "It needs arrays rotations [frames, joints, 4], root [frames, 3] and fps, or poses,"
-        " trans and mocap_framerate as AMASS has them",
+        " trans and mocap_framerate as in AMASS",
     )

@@ -10,12 +10,13 @@ from jaxtyping import Array, Float
 
 from ..body import NUM_BODY_VERTICES, Body, linear_blend_skinning
 from ..errors import MotionError
+from ..geometry import slerp
 from ..typing import pytree
 from ._source import MAX_JOINT_FRAMES
 
-# Frames compiled together: clips of any length are cut into blocks of this many.
+# Frames per block: clips of any length share one compiled program.
 _BLOCK = 32
-# A root farther from the origin than this is a broken file [m].
+# A root farther from the origin than this indicates a damaged file [m].
 _FARTHEST = 1e5
 
 
@@ -27,8 +28,8 @@ class Motion:
     Attributes:
         rotations: Local joint rotations, wxyz, shape [frames, joints, 4].
         root: World position of the hips joint [m], shape [frames, 3].
-        fps: Frames a second [1/s].
-        name: What the clip is called.
+        fps: Frame rate [1/s].
+        name: Name of the clip.
     """
 
     rotations: Float[Array, "frames joints 4"]
@@ -48,14 +49,14 @@ def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "mot
     Args:
         rotations: Local quaternions, wxyz, shape [frames, joints, 4].
         root: Hips positions [m], shape [frames, 3].
-        fps: Frames a second.
+        fps: Frames per second.
         name: Name used in errors and outputs.
 
     Raises:
-        MotionError: Wrong shapes, no frame, a rate that isn't positive, a value that
-            isn't finite, or a zero quaternion. The text names the frame and joint.
+        MotionError: Wrong shapes, no frames, a rate that isn't positive, a value that
+            isn't finite, or a zero quaternion. The message names the frame and joint.
     """
-    # Before anything is copied: an archive of kilobytes may hold gigabytes of zeros.
+    # Checked before copying: an archive of kilobytes may hold gigabytes of zeros.
     shape, places = np.shape(rotations), np.shape(root)
     if len(shape) != 3 or shape[2] != 4 or places != (shape[0], 3) or shape[0] == 0:
         raise MotionError(
@@ -67,7 +68,7 @@ def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "mot
     if shape[0] * shape[1] > MAX_JOINT_FRAMES:
         raise MotionError(f"{name}: {shape[0]:,} frames of {shape[1]:,} joints. Cut the clip.")
     r, p = (np.asarray(x, dtype=np.float64) for x in (rotations, root))
-    # Beyond this the cast to float32 would leave no millimetres.
+    # Beyond this, float32 can't resolve millimetres.
     p = np.where(np.abs(p) < _FARTHEST, p, np.nan)
     bad = ~np.isfinite(r).all(axis=2)
     bad_root = ~np.isfinite(p).all(axis=1)
@@ -97,12 +98,12 @@ def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "mot
 
 
 def sample(motion: Motion, times: Float[np.ndarray, " frames"], fps: float) -> Motion:
-    """The motion at given times, by spherical interpolation between its frames.
+    """Samples a motion at given times, by spherical interpolation between its frames.
 
     Args:
         motion: A clip.
         times: Times from its first frame [s]; those outside take the nearest frame.
-        fps: Rate to note in the result [1/s].
+        fps: Frame rate of the result [1/s].
 
     Returns:
         One frame for each time.
@@ -118,18 +119,18 @@ def sample(motion: Motion, times: Float[np.ndarray, " frames"], fps: float) -> M
 
 
 def resample(motion: Motion, fps: float | int) -> Motion:
-    """The same motion at another frame rate.
+    """Resamples a motion to another frame rate.
 
     Args:
         motion: A clip.
-        fps: Frames a second wanted.
+        fps: New frame rate [1/s].
 
     Returns:
         The clip from its first frame to its last, or to just before it if the
         duration isn't a whole number of new frames.
 
     Raises:
-        MotionError: If ``fps`` isn't positive, or the result would fill the memory.
+        MotionError: ``fps`` isn't positive, or the result has too many frames.
     """
     if not (np.isfinite(fps) and fps > 0):
         raise MotionError(f"fps is {fps}, expected a positive number.")
@@ -137,39 +138,17 @@ def resample(motion: Motion, fps: float | int) -> Motion:
     wanted = duration * fps
     if wanted * motion.rotations.shape[1] > MAX_JOINT_FRAMES:
         raise MotionError(
-            f"{duration:.0f} s at {fps:g} frames a second are more than are computed at once. Say"
-            " the file's true rate (source_fps), or cut the clip."
+            f"{duration:.0f} s at {fps:g} frames per second are too many frames. Pass the file's"
+            " true rate (source_fps), or cut the clip."
         )
     frames = int(np.floor(wanted + 1e-6)) + 1
     return sample(motion, np.arange(frames) / fps, fps)
 
 
-def slerp(
-    a: Float[np.ndarray, "*batch 4"],
-    b: Float[np.ndarray, "*batch 4"],
-    t: Float[np.ndarray, "*#batch 1"],
-) -> Float[np.ndarray, "*batch 4"]:
-    """Spherical interpolation of unit quaternions, the short way round.
-
-    Where both are nearly equal it is normalised linear interpolation (on the host:
-    clips have any length, and each length would be compiled anew).
-    """
-    dot = np.sum(a * b, axis=-1, keepdims=True)
-    b = np.where(dot < 0, -b, b)
-    dot = np.minimum(np.abs(dot), 1.0)
-    near = dot > 0.9995
-    theta = np.arccos(np.where(near, 0.0, dot))
-    sine = np.sin(theta)
-    wa = np.where(near, 1.0 - t, np.sin((1.0 - t) * theta) / sine)
-    wb = np.where(near, t, np.sin(t * theta) / sine)
-    q = wa * a + wb * b
-    return q / np.linalg.norm(q, axis=-1, keepdims=True)
-
-
 def body_animation(
     body: Body, motion: Motion, shape: Float[Array, " shapes"] | None = None
 ) -> Float[Array, "frames vertices 3"]:
-    """Body vertices [m] of every frame, one frame at a time to bound memory."""
+    """Body vertices [m] of every frame, computed in blocks to bound memory."""
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     return animate(body, rest, rest[:NUM_BODY_VERTICES], _body_weights(body), motion)
 
@@ -181,15 +160,15 @@ def animate(
     weights: Float[Array, "vertices joints"],
     motion: Motion,
 ) -> Float[Array, "frames vertices 3"]:
-    """Any skinned vertices through a clip.
+    """Skins vertices in every frame of a clip.
 
     Clips of any length share one compiled block of frames.
 
     Args:
         body: The body.
         rest: Rest positions of all its vertices, from `Body.rest_vertices` [m].
-        vertices: Rest positions of what is skinned [m].
-        weights: Its skinning weights.
+        vertices: Rest positions of the vertices to skin [m].
+        weights: Their skinning weights.
         motion: The clip.
 
     Returns:
@@ -208,7 +187,7 @@ def animate(
 
 
 def check_joints(body: Body, motion: Motion) -> None:
-    """Refuses a motion of another skeleton.
+    """Raises if a motion belongs to another skeleton.
 
     Raises:
         MotionError: The numbers of joints differ.

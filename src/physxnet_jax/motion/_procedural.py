@@ -1,7 +1,7 @@
-"""Built-in clips made of a few sines, so that the package needs no motion file.
+"""Built-in clips made of a few sine curves, so that the package needs no motion file.
 
-Angles are local turns [rad] relative to a person standing with hanging arms, about
-the world axes of that stance: +X leans forward and bends knees, -X lifts thighs and
+Angles are local rotations [rad] relative to a standing pose with hanging arms, about
+the world axes of that pose: +X leans forward and bends knees, -X lifts thighs and
 forearms, +Z lifts the left arm sideways, +Y turns to the left.
 """
 
@@ -21,11 +21,11 @@ from ._source import MAX_JOINT_FRAMES
 
 _X, _Y, _Z = np.eye(3)
 _TAU = 2 * np.pi
-# Widths over which steps along the floor and up and down are smoothed [s]: where the standing
-# foot changes, hips that followed it at once would be jerked at several g.
-_GLIDE, _RISE = 0.08, 0.03
-# Steps are followed at least this often [1/s], so that clips are the same at every rate.
-_STEPPED = 120.0
+# Smoothing widths of the hips' horizontal and vertical path [s]: without smoothing, a change of
+# the standing foot would accelerate the hips by several g.
+_SIGMA_XZ, _SIGMA_Y = 0.08, 0.03
+# Least rate at which steps are integrated [1/s], so that clips are the same at every fps.
+_MIN_STEP_RATE = 120.0
 Time = Float[np.ndarray, " frames"]
 Turns = Mapping[str, Float[np.ndarray, "frames 3"]]
 
@@ -53,9 +53,9 @@ def _walk(t: Time) -> tuple[Turns, Time]:
     phase = _TAU * t / 1.1
     stride, other = np.sin(phase), np.sin(phase + np.pi)
     thigh = [0.38 * swing + 0.14 for swing in (stride, other)]
-    # Knees bend before their thigh comes forward: else the foot behind would still stand.
+    # A knee bends before its thigh swings forward; else the rear foot would stay planted.
     knee = [0.15 + 0.9 * np.maximum(np.cos(phase + k), 0.0) ** 2 for k in (0.5, 0.5 + np.pi)]
-    # Soles stay level as far as ankles turn.
+    # Soles stay level within the range of the ankles.
     foot = [0.3 * np.tanh((up - bent) / 0.3) for up, bent in zip(thigh, knee, strict=True)]
     turns = {
         **_pair(_about(-_X, thigh[0]), _about(-_X, thigh[1]), "UpLeg"),
@@ -193,7 +193,7 @@ CLIPS: dict[str, Callable[[Time], tuple[Turns, Time]]] = {
     "stretch": _stretch,
     "spin": _spin,
 }
-"""Built-in clips: turns of joints and height of the feet above the floor [m]."""
+"""Built-in clips: joint rotations and height of the feet above the floor [m] over time."""
 
 
 def procedural_clip(
@@ -204,15 +204,15 @@ def procedural_clip(
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
 ) -> Motion:
-    """A built-in clip on the body's skeleton.
+    """Computes a built-in clip on the body's skeleton.
 
-    The lower foot stands still on the floor, which moves the hips; they glide from one
-    foot to the other.
+    The lower foot stays in place on the floor, and the hips move relative to it. Their path
+    is smoothed over changes of the standing foot.
 
     Args:
         name: One of ``CLIPS``.
-        fps: Frames a second.
-        seconds: Duration; four seconds show every clip once.
+        fps: Frames per second.
+        seconds: Duration [s]; four seconds show every clip once.
         body: Body to drive; the built-in one by default.
         shape: Its shape parameters.
 
@@ -220,19 +220,19 @@ def procedural_clip(
         The motion.
 
     Raises:
-        MotionError: An unknown name.
+        MotionError: An unknown name, or too many frames.
     """
     if name not in CLIPS:
         raise MotionError(f"No built-in clip '{name}'; there are {', '.join(CLIPS)}.")
     body = load_body() if body is None else body
-    often = max(1, int(np.ceil(_STEPPED / fps)))
+    often = max(1, int(np.ceil(_MIN_STEP_RATE / fps)))
     rate = often * fps
-    lead = int(np.ceil(4 * _GLIDE * rate))  # what smoothing reaches beyond both ends
+    lead = int(np.ceil(4 * _SIGMA_XZ * rate))  # margin of the smoothing at both ends
     kept = slice(lead, lead + often * max(1, round(seconds * fps)), often)
     if (kept.stop + 2 * lead) * len(body.parents) > MAX_JOINT_FRAMES:
         raise MotionError(
-            f"{seconds:g} s at {fps:g} frames a second are more than are computed at once. Ask for"
-            " fewer."
+            f"{seconds:g} s at {fps:g} frames per second are too many frames. Request a shorter"
+            " clip or a lower rate."
         )
     t = np.arange(-lead, kept.stop + lead) / rate
     turns, air = CLIPS[name](t)
@@ -256,9 +256,9 @@ def procedural_clip(
 def _planted_root(
     body: Body, motion: Motion, air: Time, shape: Float[Array, " shapes"] | None
 ) -> Float[np.ndarray, "frames 3"]:
-    """Hips positions that keep the lower foot in place and the feet at height air.
+    """Hips positions that keep the lower foot in place and the feet at height ``air``.
 
-    Smooth but for the first and last 4 ``_GLIDE`` seconds.
+    The path is smooth except within 4 horizontal smoothing widths of either end.
     """
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     ankles = [body.joint("LeftFoot"), body.joint("RightFoot")]
@@ -266,12 +266,12 @@ def _planted_root(
     follow = jnp.asarray(np.eye(len(body.parents), dtype=np.float32)[ankles])
     feet = np.asarray(animate(body, rest, heads, follow, motion), dtype=np.float64)
     left, right = feet[:, 0], feet[:, 1]
-    # A soft choice of the standing foot: a hard one would jerk the hips.
+    # Soft choice of the standing foot: a hard switch would jerk the hips.
     share = 1.0 / (1.0 + np.exp((left[:, 1] - right[:, 1]) / 0.01))
     step = share[1:, None] * np.diff(left, axis=0) + (1 - share[1:, None]) * np.diff(right, axis=0)
     root = np.zeros((len(left), 3))
     root[1:] = -np.cumsum(step, axis=0)
-    root = gaussian_filter1d(root, _GLIDE * motion.fps, axis=0, mode="nearest", truncate=4.0)
+    root = gaussian_filter1d(root, _SIGMA_XZ * motion.fps, axis=0, mode="nearest", truncate=4.0)
     feet_to_hips = -foot_heights(body, motion, rest)
-    root[:, 1] = air + gaussian_filter1d(feet_to_hips, _RISE * motion.fps, mode="nearest")
+    root[:, 1] = air + gaussian_filter1d(feet_to_hips, _SIGMA_Y * motion.fps, mode="nearest")
     return root

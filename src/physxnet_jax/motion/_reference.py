@@ -1,4 +1,4 @@
-"""A pose in which it is known where a skeleton's limbs point."""
+"""Reference pose of a skeleton, in which the directions of its limbs are known."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,20 +13,20 @@ from ._skeletons import LIMBS
 from ._source import SourceClip
 
 _BOTH = ("Left", "Right")
-# Bones shorter or longer than this have no direction that can be computed with.
+# Bones shorter or longer than this have no usable direction.
 SHORTEST, LONGEST = 1e-9, 1e9
-# At rest a skeleton stands if its legs and trunk lean less than 45 degrees.
+# A rest pose is a standing pose if its legs and trunk lean less than 45 degrees.
 _STANDING = float(np.cos(np.radians(45.0)))
-# Who points this far one way on average stands or lies like that all the time.
+# A mean trunk direction with a component above this points that way throughout the clip.
 ALWAYS = 0.8
 # DAZ figures hold their forearms 17 degrees forward in their T-pose.
 _T_POSE = float(np.cos(np.radians(25.0)))
 
 
 def upright(source: SourceClip, index: Mapping[str, int]) -> SourceClip:
-    """The clip with Y up, if its skeleton stands along Z at rest.
+    """Turns the clip to Y up if its skeleton stands along Z at rest.
 
-    If its motion stands along Y by itself the rest pose alone is turned.
+    Only the rest pose is turned if the motion stands along Y already.
     """
     if stands(source, index, 2) and not stands(source, index, 1):
         turn = Rotation.from_euler("X", -90, degrees=True).as_matrix()
@@ -38,7 +38,7 @@ def upright(source: SourceClip, index: Mapping[str, int]) -> SourceClip:
 
 
 def mean_trunk(source: SourceClip, index: Mapping[str, int]) -> Float[np.ndarray, "3"]:
-    """Which way the trunk points on average, from hips to shoulders; 1 long if always so."""
+    """Mean unit direction from hips to shoulders; its length is 1 if it is constant."""
     p = source.positions()
     hips, arms = (p[:, index[f"Left{n}"]] + p[:, index[f"Right{n}"]] for n in ("UpLeg", "Arm"))
     trunk = arms - hips
@@ -46,7 +46,7 @@ def mean_trunk(source: SourceClip, index: Mapping[str, int]) -> Float[np.ndarray
 
 
 def stands(source: SourceClip, index: Mapping[str, int], axis: int) -> bool:
-    """Whether both legs point down this axis at rest, and the arms lie above them."""
+    """Whether both legs point down this axis at rest, and the trunk points up."""
     positions = _pose_positions(source, source.rest_rotations())
     legs = [positions[index[f"{s}Foot"]] - positions[index[f"{s}UpLeg"]] for s in _BOTH]
     trunk = _trunk(positions, index)
@@ -57,16 +57,16 @@ def stands(source: SourceClip, index: Mapping[str, int], axis: int) -> bool:
 def reference_pose(
     source: SourceClip, index: Mapping[str, int], may_have_t_pose: bool
 ) -> tuple[Float[np.ndarray, "bones 3 3"], int, Float[np.ndarray, "3 3"]]:
-    """The reference pose.
+    """Finds the reference pose of a clip.
 
     Args:
         source: The clip.
-        index: Body joint to joint of the clip.
+        index: Body joint to index of the clip's joint.
         may_have_t_pose: Frame 0 may be a T-pose that isn't part of the motion, as in
-            files that can't say how the skeleton rests.
+            formats that can't store a rest pose.
 
     Returns:
-        Its world rotations, the first frame of motion, and which way the person stands
+        Its world rotations, the first frame of motion, and the orientation of the person
         in it (columns left, up, forward).
     """
     first = source.rotations[0]
@@ -88,7 +88,7 @@ def reference_pose(
     if not standing:
         frame = _straightest(source, index)
         return source.rotations[frame], 0, _stance(source, frame, index)
-    # CMU's skeletons stand astride at rest: straighten each leg as one.
+    # CMU's skeletons stand astride at rest: turn each leg as a whole to a vertical thigh.
     pose = rest.copy()
     pointing = limb_directions(source, index, pose)
     for side in _BOTH:
@@ -105,9 +105,9 @@ def reference_pose(
 def _heading(
     positions: Float[np.ndarray, "bones 3"], index: Mapping[str, int]
 ) -> Float[np.ndarray, "3 3"]:
-    """Left, up and forward of a standing skeleton; the world's axes within 45 degrees of them.
+    """Left, up and forward of a standing skeleton; the world's axes if within 45 degrees of them.
 
-    Hips of real skeletons aren't quite level with an axis that their makers meant.
+    The hips of real skeletons are only roughly parallel to the intended axis.
     """
     left = positions[index["LeftUpLeg"]] - positions[index["RightUpLeg"]]
     left = left * [1.0, 0.0, 1.0]
@@ -121,7 +121,7 @@ def _heading(
 def _straightest(source: SourceClip, index: Mapping[str, int]) -> int:
     """The frame in which the person stands most upright on straight legs.
 
-    The turn of a limb about itself is then taken as at rest, which holds for standing.
+    The limbs' twist is assumed to be that of the rest pose, which holds for standing.
     """
     p = source.positions()
     unit = lambda d: d / np.maximum(np.linalg.norm(d, axis=-1, keepdims=True), 1e-9)  # noqa: E731
@@ -160,7 +160,7 @@ def _no_trunk(source: SourceClip) -> MotionError:
     return MotionError.at(
         source.path,
         None,
-        "hips and shoulders lie in one point or on one line, so nobody knows which way is up",
+        "hips and shoulders lie on one point or one line, so the up direction is undefined",
         "Map other joints",
     )
 

@@ -1,4 +1,4 @@
-"""From any humanoid skeleton to the body's own."""
+"""Retargeting from any humanoid skeleton to the body's."""
 
 from collections.abc import Callable, Mapping
 
@@ -14,9 +14,9 @@ from ._reference import LONGEST, SHORTEST, limb_directions, reference_pose, upri
 from ._skeletons import NEEDED, find_joint_map, nearest_joint_map
 from ._source import SourceClip
 
-# How long the way from a T-pose takes at most [s], and how much faster it is than a clip's
-# fastest twentieth.
-_APPROACH, _SUDDEN = 0.25, 1.5
+# Longest blend from a T-pose at a clip's start [s], and how much faster it turns than the 95th
+# percentile of the clip (factor).
+_MAX_BLEND, _BLEND_SPEED = 0.25, 1.5
 
 
 def retarget(
@@ -26,27 +26,31 @@ def retarget(
     joint_map: Mapping[str, str] | None = None,
     shape: Float[Array, " shapes"] | None = None,
 ) -> Motion:
-    """The clip on the body's skeleton.
+    """Retargets a clip to the body's skeleton.
 
-    Rotations are carried over relative to a reference pose in which the source's
-    limbs are known: a T-pose in frame 0 if there is one (it is dropped), else the
-    skeleton's rest pose with its legs made straight, if a person stands in it (a
-    skeleton that stands along Z is turned upright), else the frame in which the
-    person stands straightest. The body is first put in that pose, so its limbs then
-    point exactly where the source's do. Positions are scaled by leg length and the
-    clip is lifted so that its lowest point touches the floor.
+    Rotations are transferred relative to a reference pose in which the directions of the
+    source's limbs are known. It is the first of these that exists:
+
+    * a T-pose in frame 0, which is then dropped;
+    * the rest pose with its legs turned to vertical, if it is a standing pose (a skeleton that
+      stands along Z is turned upright);
+    * the frame in which the person stands straightest.
+
+    The body is first put in that pose, so that its limbs point exactly where the source's
+    do. Positions are scaled by leg length, and the clip is moved vertically so that the
+    feet's lowest vertex touches the floor.
 
     Args:
-        source: Clip as read.
+        source: Clip as read from a file.
         body: Body to drive; the built-in one by default.
-        joint_map: Body joint to source joint; found by the names if omitted.
+        joint_map: Body joint to source joint; matched by name if omitted.
         shape: Shape parameters of the body, which set its proportions.
 
     Returns:
         Motion in metres, Y up.
 
     Raises:
-        MotionError: Unknown joints, a map without the limbs, a limb of length zero.
+        MotionError: Unknown joints, a joint map without the limbs, or a limb of length zero.
     """
     body = load_body() if body is None else body
     index = joint_index(source, body, joint_map)
@@ -87,22 +91,23 @@ def retarget(
         .reshape(len(root), -1, 4)
     )
     if start:
-        quaternions, root = _without_approach(quaternions, root, source.fps)
+        quaternions, root = _without_t_pose_blend(quaternions, root, source.fps)
     motion = make_motion(quaternions, root, source.fps, name=source.name)
     return stand_on_floor(body, motion, rest)
 
 
-def _without_approach(
+def _without_t_pose_blend(
     q: Float[np.ndarray, "frames joints 4"], root: Float[np.ndarray, "frames 3"], fps: float
 ) -> tuple[Float[np.ndarray, "frames joints 4"], Float[np.ndarray, "frames 3"]]:
-    """The clip without its way from the T-pose, which no person goes: it begins as it goes on.
+    """Removes the blend from a T-pose at the start of a converted clip.
 
-    Conversions blend from their T-pose within a few frames; their number stays.
+    Such clips blend from the T-pose to the motion within a few frames. These are replaced by
+    the first frame after them, so the number of frames stays the same.
     """
     turned = 2.0 * np.arccos(np.clip(np.abs(np.sum(q[1:] * q[:-1], axis=2)), 0.0, 1.0)).max(axis=1)
-    few = min(int(_APPROACH * fps), len(turned) // 3)
+    few = min(int(_MAX_BLEND * fps), len(turned) // 3)
     usual = np.quantile(turned[few:], 0.95) if few else np.inf
-    settled = int(np.argmax(np.append(turned[:few] <= _SUDDEN * usual, True)))
+    settled = int(np.argmax(np.append(turned[:few] <= _BLEND_SPEED * usual, True)))
     if settled:
         q, root = q.copy(), root.copy()
         q[:settled], root[:settled] = q[settled], root[settled]
@@ -112,23 +117,23 @@ def _without_approach(
 def joint_index(
     source: SourceClip, body: Body, joint_map: Mapping[str, str] | None = None
 ) -> dict[str, int]:
-    """Joints of the body to places of theirs in a skeleton, by a map and by the names.
+    """Body joint to index of the skeleton's joint, by the joint map and by known names.
 
-    What the map leaves out is taken from the nearest family, if its names are there.
+    Joints missing from the map are taken from the nearest family if the skeleton has them.
 
     Raises:
-        MotionError: Unknown joints, a map without the limbs.
+        MotionError: Unknown joints, or a joint map without the limbs.
     """
     if joint_map is None:
         joints = find_joint_map(source)[1]
     else:
-        told = set(joint_map.values())
+        mapped = set(joint_map.values())
         known = nearest_joint_map(source)[1]
-        joints = {b: s for b, s in known.items() if s not in told} | dict(joint_map)
-    lacking, strange = NEEDED - joints.keys(), joints.keys() - set(body.joint_names)
-    if lacking or strange:
+        joints = {b: s for b, s in known.items() if s not in mapped} | dict(joint_map)
+    lacking, unknown = NEEDED - joints.keys(), joints.keys() - set(body.joint_names)
+    if lacking or unknown:
         wrong = [f"lacks {', '.join(sorted(lacking))}"] if lacking else []
-        wrong += [f"has {', '.join(sorted(strange))}, which the body hasn't"] if strange else []
+        wrong += [f"has {', '.join(sorted(unknown))}, which the body lacks"] if unknown else []
         raise MotionError.at(
             source.path,
             None,
@@ -149,7 +154,7 @@ def joint_index(
 
 
 def leg_length(positions: Float[np.ndarray, "joints 3"], place: Callable[[str], int]) -> float:
-    """Length of both legs from hip to ankle, joints where `place` says."""
+    """Total length of both legs from hip to ankle; `place` maps joint names to rows."""
     ways = [
         positions[place(f"{side}{low}")] - positions[place(f"{side}{high}")]
         for side in ("Left", "Right")
@@ -159,7 +164,7 @@ def leg_length(positions: Float[np.ndarray, "joints 3"], place: Callable[[str], 
 
 
 def stand_on_floor(body: Body, motion: Motion, rest: Float[Array, "all 3"]) -> Motion:
-    """The clip lifted or lowered as a whole so that its lowest foot vertex is at y=0."""
+    """Moves the whole clip vertically so that its lowest foot vertex is at y=0."""
     low = float(foot_heights(body, motion, rest).min())
     root = np.asarray(motion.root) - np.array([[0.0, low, 0.0]], np.float32)
     return Motion(motion.rotations, jnp.asarray(root), motion.fps, motion.name)
@@ -205,7 +210,7 @@ def _world_rotations(
 def continuous(
     q: Float[np.ndarray, "frames joints 4"],
 ) -> Float[np.ndarray, "frames joints 4"]:
-    """Signs chosen so that successive quaternions are near each other."""
+    """Flips signs so that successive quaternions are near each other."""
     flips = np.sign(np.sum(q[1:] * q[:-1], axis=2, keepdims=True))
     sign = np.cumprod(np.where(flips == 0, 1.0, flips), axis=0)
     return np.concatenate([q[:1], q[1:] * sign])

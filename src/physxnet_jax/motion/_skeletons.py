@@ -1,4 +1,4 @@
-"""Names of joints: families of skeletons, and maps of one's own."""
+"""Joint names: known families of skeletons, and custom joint maps."""
 
 import pathlib
 import tomllib
@@ -68,7 +68,7 @@ JOINT_MAPS: dict[str, dict[str, str]] = {
         ("{l}_collar", "{l}_shoulder", "{l}_elbow", "{l}_wrist"),
         ("{l}_hip", "{l}_knee", "{l}_ankle", "{l}_foot"),
     ),
-    # VRM's humanoid, which is Unity's.
+    # VRM's humanoid bones, which are Unity's.
     "vrm": _family(
         ("hips", "spine", "chest", "upperChest", "neck", None, "head"),
         ("{l}Shoulder", "{l}UpperArm", "{l}LowerArm", "{l}Hand"),
@@ -89,7 +89,7 @@ JOINT_MAPS: dict[str, dict[str, str]] = {
         ("clavicle_{s}", "upperarm_{s}", "lowerarm_{s}", "hand_{s}"),
         ("thigh_{s}", "calf_{s}", "foot_{s}", "ball_{s}"),
     ),
-    # Blender's, its bones of deformation too (DEF-).
+    # Blender's Rigify, including its deformation bones (DEF-).
     "rigify": _family(
         ("spine", *(f"spine.00{n}" for n in range(1, 7))),
         ("shoulder.{B}", "upper_arm.{B}", "forearm.{B}", "hand.{B}"),
@@ -100,7 +100,7 @@ JOINT_MAPS: dict[str, dict[str, str]] = {
         ("clavicle.{B}", "upperarm01.{B}", "lowerarm01.{B}", "wrist.{B}"),
         ("upperleg01.{B}", "lowerleg01.{B}", "foot.{B}", None),
     ),
-    # 3ds Max's character studio: Bip01 or Bip001 stands before every name.
+    # 3ds Max's Character Studio: every name begins with Bip01 or Bip001.
     "biped": _family(
         ("Pelvis", "Spine", "Spine1", "Spine2", "Neck", None, "Head"),
         ("{B} Clavicle", "{B} UpperArm", "{B} Forearm", "{B} Hand"),
@@ -142,18 +142,17 @@ LIMBS = {
 """Limb bones: joint at the start, joint at the end."""
 
 NEEDED = frozenset({"Hips", *LIMBS, *LIMBS.values()})
-"""Joints without which a person can't be followed."""
+"""Joints that retargeting requires."""
 
 
 def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
-    """The family whose joints the skeleton has, whatever stands before their names.
+    """Finds the family of a skeleton's joint names, whatever prefix they have.
 
-    Letters' case, spaces, dots, dashes and underscores don't count, as programs change
-    them on the way. Joints that aren't limbs may be missing: they then follow their
-    parents.
+    Case, spaces, dots, dashes and underscores are ignored, since programs change them.
+    Joints other than hips and limbs may be missing; the body's then follow their parents.
 
     Raises:
-        MotionError: If none fits; the text lists what is missing from the nearest.
+        MotionError: No family fits; the message lists the joints missing from the nearest.
     """
     family, joints = nearest_joint_map(source)
     if NEEDED - joints.keys():
@@ -162,8 +161,8 @@ def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
         raise MotionError.at(
             source.path,
             None,
-            f"unknown joints: of {len(JOINT_MAPS)} known skeletons the nearest, {family}, would"
-            f" have {lacks} too",
+            f"unknown joints: the nearest of {len(JOINT_MAPS)} known skeletons, {family}, has"
+            f" {lacks} as well",
             "Pass a joint map (--joint-map FILE, joint_map={'Hips': 'your name', …}); the"
             f" file has {', '.join(source.names[:40])}",
         )
@@ -171,7 +170,7 @@ def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
 
 
 def nearest_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
-    """The family of which the skeleton has most, and what it has of it."""
+    """The family that fits the skeleton best, and the joints of it that the skeleton has."""
     have = {_plain(name): name for name in reversed(source.names)}
     found: dict[str, dict[str, str]] = {}
     for family, joints in JOINT_MAPS.items():
@@ -195,23 +194,23 @@ def _plain(name: str) -> str:
 
 
 def read_joint_map(path: str | pathlib.Path) -> dict[str, str]:
-    """A joint map from a TOML file of lines `Hips = "the file's name"`.
+    """Reads a joint map from a TOML file of lines `Hips = "the file's name"`.
 
     Args:
-        path: The file; its keys are joints of the body.
+        path: The file; its keys are body joints.
 
     Returns:
         Body joint to the file's joint.
 
     Raises:
-        MotionError: Not TOML, not names alone, or joints that the body hasn't.
+        MotionError: Not TOML, values that aren't names, or joints that the body lacks.
     """
     path = pathlib.Path(path)
     try:
         if path.stat().st_size > 1_000_000:
-            raise MotionError.at(path, None, "over 1 MB", "A joint map is a page of names")
+            raise MotionError.at(path, None, "over 1 MB", "A joint map is a short list of names")
         joints = tomllib.loads(path.read_text(encoding="utf-8"))
-    # TOMLDecodeError is one of ValueError; so are names and numbers that Python refuses.
+    # A ValueError is also raised for invalid paths and for numbers that Python rejects.
     except (OSError, ValueError, RecursionError) as error:
         if isinstance(error, MotionError):
             raise
@@ -224,7 +223,7 @@ def read_joint_map(path: str | pathlib.Path) -> dict[str, str]:
         raise MotionError.at(
             path,
             None,
-            f"{', '.join(wrong[:6]) or 'no line'} is no joint of the body with a name",
+            f"{', '.join(wrong[:6]) or 'an empty file'} doesn't map a body joint to a name",
             f'The body has {", ".join(known)}; write lines like Hips = "pelvis"',
         )
     return joints

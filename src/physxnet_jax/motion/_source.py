@@ -1,4 +1,4 @@
-"""A motion as its file tells it: any skeleton, any unit, before retargeting."""
+"""Motion as read from a file, before retargeting: any skeleton, any unit."""
 
 import dataclasses
 
@@ -8,27 +8,13 @@ from jaxtyping import Float
 from ..errors import MotionError
 
 MAX_JOINT_FRAMES = 6e6
-"""Frames times joints that a clip may have: eleven minutes at 120 fps of 75 joints."""
+"""Limit on frames times joints of a clip: eleven minutes at 120 fps with 75 joints."""
 
 _FARTHEST = 1e9
-_BROADCAST = tuple(k * 1000.0 / 1001.0 for k in (24, 30, 48, 60, 120))
-
-
-def nominal_rate(fps: float) -> float:
-    """The rate that a file means by a rounded one [1/s]: a whole one or a broadcaster's.
-
-    Example:
-        >>> nominal_rate(1 / 0.0083333), nominal_rate(1 / 0.0333)
-        (120.0, 30.0)
-        >>> round(nominal_rate(29.97), 5)
-        29.97003
-    """
-    nearest = min((float(round(fps)), *_BROADCAST), key=lambda r: abs(r - fps))
-    return nearest if nearest > 0 and abs(nearest - fps) < 0.05 else fps
 
 
 def is_real(values: np.ndarray) -> bool:
-    """Whether an array of a file holds plain numbers, which float64 can hold."""
+    """Whether an array has a real dtype of at most 8 bytes, which float64 can hold."""
     return values.dtype.kind in "fiu" and values.dtype.itemsize <= 8
 
 
@@ -42,16 +28,16 @@ class SourceClip:
         offsets: Position of a joint in its parent's frame, shape [joints, 3].
         rotations: World rotation of every joint, shape [frames, joints, 3, 3].
         root: World position of the root, shape [frames, 3].
-        fps: Frames a second, as the file says.
+        fps: Frames per second, as declared by the file.
         name: Name of the clip.
-        path: Where it was read from, for errors.
+        path: File that the clip was read from, for error messages.
         rest: World rotation of every joint in the skeleton's rest pose, shape
-            [joints, 3, 3]; no rotation at all if omitted.
-        shifts: Position of every joint in its parent's frame where it changes, shape
-            [frames, joints, 3]; `offsets` all the time if omitted.
+            [joints, 3, 3]; identity if omitted.
+        shifts: Position of every joint in its parent's frame if it varies over time, shape
+            [frames, joints, 3]; `offsets` in every frame if omitted.
 
     Raises:
-        MotionError: Places that no skeleton has in any unit.
+        MotionError: Positions too large for a skeleton in any unit.
     """
 
     names: tuple[str, ...]
@@ -66,7 +52,7 @@ class SourceClip:
     shifts: Float[np.ndarray, "frames joints 3"] | None = None
 
     def __post_init__(self) -> None:
-        # Sums of what is farther away keep no digit of a limb.
+        # Sums of larger distances would lose the digits of a limb.
         for x in (self.offsets, self.root, self.shifts):
             if x is not None and (np.abs(x) > _FARTHEST).any():
                 raise MotionError.at(
@@ -89,7 +75,7 @@ class SourceClip:
         return out
 
     def turned(self, turn: Float[np.ndarray, "3 3"]) -> "SourceClip":
-        """The same clip with the whole world rotated, its rest pose too."""
+        """The clip with the whole world rotated, including its rest pose."""
         rest = self.rest_rotations()
         return dataclasses.replace(
             self, rotations=turn @ self.rotations, root=self.root @ turn.T, rest=turn @ rest

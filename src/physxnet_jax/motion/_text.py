@@ -10,7 +10,7 @@ from jaxtyping import Float
 from ..errors import MotionError
 from ..files import is_file
 
-# No length in any unit, and no angle.
+# No length or angle is larger, in any unit.
 _LARGEST = 1e12
 # Ten minutes at 120 fps of 30 joints is 60 MB as text.
 _MAX_BYTES = 512_000_000
@@ -20,7 +20,7 @@ def read_lines(path: pathlib.Path, kind: str) -> list[str]:
     """Lines of a text file.
 
     Raises:
-        MotionError: Missing, empty, binary or absurdly large.
+        MotionError: The file is missing, empty, binary or too large.
     """
     if not is_file(path):
         raise MotionError.at(path, None, "no such file", "Check the path")
@@ -47,17 +47,17 @@ def read_lines(path: pathlib.Path, kind: str) -> list[str]:
 
 
 def is_count(word: str) -> bool:
-    """Whether a word is a whole number of digits that int() takes, and not absurdly many."""
+    """Whether a word consists of ASCII digits, at most 18 of them."""
     return word.isascii() and word.isdigit() and len(word) < 19
 
 
 def numbers(path: pathlib.Path, line: int, words: list[str]) -> list[float]:
-    """Finite numbers of one line.
+    """Parses the finite numbers of one line.
 
     Raises:
-        MotionError: A word that isn't a number, or NaN, infinity or one beyond any measure.
+        MotionError: A word that isn't a number, or is NaN, infinite or out of range.
     """
-    # Files hold millions: the words are looked at one by one only where something is wrong.
+    # Files hold millions of numbers: words are checked one by one only if the line is faulty.
     try:
         out = list(map(float, words))
     except ValueError:
@@ -76,7 +76,7 @@ def numbers(path: pathlib.Path, line: int, words: list[str]) -> list[float]:
                 path,
                 line,
                 f"the value '{word[:40]}' is "
-                + ("beyond any measure" if math.isfinite(value) else "not finite"),
+                + ("out of range" if math.isfinite(value) else "not finite"),
                 "Cut this frame out or interpolate over it",
             )
     return out
@@ -85,17 +85,17 @@ def numbers(path: pathlib.Path, line: int, words: list[str]) -> list[float]:
 def table(
     path: pathlib.Path, lines: Sequence[str], which: Sequence[int], skip: int, width: int
 ) -> Float[np.ndarray, "rows numbers"]:
-    """Numbers of many lines at once.
+    """Parses the numbers of many lines at once.
 
     Args:
         path: The file, for errors.
         lines: All its lines.
-        which: Those wanted, counted from 1; each has `width` words after the first `skip`.
+        which: Lines to parse, counted from 1; each has `width` words after the first `skip`.
         skip: Words before the numbers.
-        width: Numbers of a line.
+        width: Numbers per line.
 
     Raises:
-        MotionError: As `numbers`, of the first line where something is wrong.
+        MotionError: As for `numbers`, for the first faulty line.
     """
     words = (word for n in which for word in lines[n - 1].split()[skip:])
     try:

@@ -1,4 +1,4 @@
-"""Joint transforms of a clip, in blocks of one size so that nothing is recompiled."""
+"""Joint transforms of a clip, in blocks of fixed size to avoid recompilation."""
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,7 @@ from ..geometry import quaternion_conjugate, quaternion_multiply, safe_normalize
 from ._motion import Motion, check_joints
 
 BLOCK = 16
-"""Frames computed together."""
+"""Frames per block."""
 
 
 def clip_transforms(
@@ -34,21 +34,21 @@ def _transforms(body: Body, rest: Array, q: Array, p: Array) -> tuple[Array, Arr
     return jax.vmap(lambda a, b: body.transforms(rest, a, b))(jnp.asarray(q), jnp.asarray(p))
 
 
-def poses_before(
+def extrapolate_history(
     rotations: Float[Array, "frames joints 4"],
     root: Float[Array, "frames 3"],
     count: int,
 ) -> tuple[Float[Array, "before joints 4"], Float[Array, "before 3"]]:
-    """What a person did before a clip began, if it went on as it begins; pure.
+    """Extrapolates poses before frame 0 at constant velocity; pure.
 
-    Every joint turns, and the root goes, as fast as between the clip's first two poses: no
-    acceleration is made up, where a person who stood still until then would be thrown into
-    motion within a frame, the harder the more frames a second there are.
+    Every joint and the root keep the velocity between the clip's first two poses, so the
+    clip starts without acceleration. A person at rest before frame 0 would instead be
+    accelerated within one frame, more strongly at higher frame rates.
 
     Args:
         rotations: Joint rotations of the clip, wxyz.
         root: Positions of the root joint [m].
-        count: Poses wanted; who has a single pose stood still in it.
+        count: Number of poses; a one-frame clip is treated as static.
 
     Returns:
         Rotations and root positions, oldest first.
@@ -56,10 +56,10 @@ def poses_before(
     rotations, root = jnp.asarray(rotations), jnp.asarray(root)
     if count == 0:
         return rotations[:0], root[:0]
-    # In JAX's numbers: an exported clip's length is none of NumPy's.
+    # With jnp, not NumPy: the length of an exported clip may be symbolic.
     second = jnp.minimum(1, rotations.shape[0] - 1)
     q, p = rotations[second], root[second]
-    # A pose that isn't finite spoils no frame before it.
+    # A second pose that isn't finite must not spread to the frames before it.
     known = jnp.isfinite(q).all() & jnp.isfinite(p).all()
     q, p = jnp.where(known, q, rotations[0]), jnp.where(known, p, root[0])
     step = safe_normalize(quaternion_multiply(rotations[0], quaternion_conjugate(q)))
@@ -72,22 +72,22 @@ def poses_before(
     return jnp.stack(turns[::-1]), jnp.stack(places[::-1])
 
 
-def before_transforms(
+def history_transforms(
     body: Body,
     rest: Float[Array, "all 3"],
     motion: Motion,
     count: int,
     past: Motion | None = None,
 ) -> tuple[Float[np.ndarray, "before joints 3 3"], Float[np.ndarray, "before joints 3"]]:
-    """`clip_transforms` of what was before a clip.
+    """`clip_transforms` of the frames before a clip.
 
     Args:
         body: The body.
         rest: Its rest vertices [m].
         motion: The clip.
-        count: Frames wanted.
-        past: Those of the same motion that come before it; what lies before them is
-            `poses_before`.
+        count: Number of frames.
+        past: Frames of the same motion before the clip; earlier ones are extrapolated
+            (`extrapolate_history`).
     """
     joints = len(body.parents)
     if count == 0:
@@ -97,12 +97,12 @@ def before_transforms(
     if past is not None and known:
         q = jnp.concatenate([jnp.asarray(past.rotations)[-known:], q])
         p = jnp.concatenate([jnp.asarray(past.root)[-known:], p])
-    early = poses_before(q, p, count - known)
+    early = extrapolate_history(q, p, count - known)
     q, p = (jnp.concatenate([a, b[:known]]) for a, b in zip(early, (q, p), strict=True))
     return clip_transforms(body, rest, Motion(q, p, motion.fps, motion.name))
 
 
 def padded_block(values: np.ndarray, start: int, before: int) -> np.ndarray:
-    """``BLOCK`` frames from ``start`` and some before it; the ends are repeated."""
+    """``BLOCK`` frames from ``start`` and ``before`` frames ahead of it; ends are repeated."""
     index = np.arange(start - before, start + BLOCK)
     return values[np.clip(index, 0, len(values) - 1)]

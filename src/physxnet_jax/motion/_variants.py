@@ -1,4 +1,4 @@
-"""The same action as another person would do it: mirrored, slower, larger, with other arms."""
+"""Variants of a motion: mirrored, at another speed, exaggerated, with another upper body."""
 
 import re
 
@@ -10,15 +10,15 @@ from ..body import Body
 from ..errors import MotionError
 from ._motion import Motion, check_joints, make_motion, sample
 
-# A joint is never swung further than this from its mean [rad].
-_WIDEST = 2.6
+# Limit of an exaggerated joint's angle from its mean [rad].
+_MAX_SWING = 2.6
 
 
 def mirror_joints(body: Body) -> Int[np.ndarray, " joints"]:
-    """For each joint its counterpart on the other side; itself in the middle.
+    """Index of each joint's counterpart on the other side, its own for a middle joint.
 
     Raises:
-        MotionError: A joint of one side without its counterpart.
+        MotionError: A joint has no counterpart on the other side.
     """
     names = list(body.joint_names)
     swapped = [re.sub(r"^(Left|Right|[LR](?=Hip|Thumb))", _other, n) for n in names]
@@ -36,14 +36,14 @@ def _other(match: re.Match[str]) -> str:
 
 
 def mirrored(body: Body, motion: Motion) -> Motion:
-    """The motion as a mirror shows it: left and right are exchanged.
+    """Mirrors a motion: left and right are exchanged.
 
     Args:
-        body: The body, whose skeleton is the same on both sides.
+        body: The body; its skeleton must be the same on both sides.
         motion: The motion.
 
     Raises:
-        MotionError: A skeleton with one side alone.
+        MotionError: The skeleton isn't the same on both sides.
 
     Note:
         In a plane mirror x -> -x a rotation by the vector (a, b, c) becomes one by
@@ -55,7 +55,7 @@ def mirrored(body: Body, motion: Motion) -> Motion:
 
 
 def frames_at_speed(frames: int, speed: float) -> int:
-    """How many frames are left of a clip that is played so many times as fast."""
+    """Number of frames of a clip when it is played at ``speed`` times its speed."""
     return int(np.floor((frames - 1) / speed + 1e-6)) + 1
 
 
@@ -64,7 +64,7 @@ def at_speed(motion: Motion, speed: float) -> Motion:
 
     Args:
         motion: The motion.
-        speed: How many times as fast.
+        speed: Speed factor; above 1 is faster.
 
     Raises:
         MotionError: A speed that isn't positive.
@@ -79,13 +79,13 @@ def at_speed(motion: Motion, speed: float) -> Motion:
 
 
 def exaggerated(motion: Motion, factor: float) -> Motion:
-    """The motion with every joint swung further, or less far, from its mean pose.
+    """Scales every joint's rotation relative to its mean.
 
-    The root and where it faces stay as they are.
+    The root keeps its position and orientation.
 
     Args:
         motion: The motion.
-        factor: How many times as far each joint turns from its mean rotation.
+        factor: Factor on the angle between each joint's rotation and its mean.
 
     Raises:
         MotionError: A factor that isn't positive.
@@ -98,29 +98,29 @@ def exaggerated(motion: Motion, factor: float) -> Motion:
         turns = Rotation.from_quat(np.roll(local[:, joint], -1, axis=1))
         mean = turns.mean()
         swing = (mean.inv() * turns).as_rotvec() * factor
-        # Half a turn away there is no telling which way is further.
+        # At half a turn from the mean, the direction of the swing is ambiguous.
         angle = np.linalg.norm(swing, axis=1, keepdims=True)
-        swing = swing * np.minimum(1.0, _WIDEST / np.maximum(angle, _WIDEST))
+        swing = swing * np.minimum(1.0, _MAX_SWING / np.maximum(angle, _MAX_SWING))
         wider = (mean * Rotation.from_rotvec(swing)).as_quat()
         rotations[:, joint + 1] = np.roll(wider, 1, axis=1)
     return make_motion(rotations, motion.root, motion.fps, name=motion.name)
 
 
 def with_upper_body(body: Body, motion: Motion, other: Motion) -> Motion:
-    """The legs and the way of one motion with the spine, arms and head of another.
+    """Combines the root and legs of one motion with the spine, arms and head of another.
 
-    The other motion is played to and fro until this one ends, so nothing jumps.
+    The other motion is played forwards and backwards until this one ends, to avoid jumps.
 
     Args:
         body: The body.
-        motion: Root, hips and legs come from here, and the length.
-        other: The rest comes from here; of the same frame rate.
+        motion: Motion of the root, hips and legs; its length is kept.
+        other: Motion of the upper body, at the same frame rate.
 
     Raises:
         MotionError: Different frame rates, or a motion of another skeleton.
     """
     if motion.fps != other.fps:
-        raise MotionError(f"{motion.fps} and {other.fps} frames a second: resample one of them.")
+        raise MotionError(f"{motion.fps} and {other.fps} frames per second: resample one of them.")
     check_joints(body, motion)
     check_joints(body, other)
     upper = _upper_joints(body)
@@ -133,7 +133,7 @@ def with_upper_body(body: Body, motion: Motion, other: Motion) -> Motion:
 
 
 def _upper_joints(body: Body) -> Int[np.ndarray, " n"]:
-    """All joints that hang from a joint whose name begins with Spine or LowerBack."""
+    """Joints whose names begin with Spine or LowerBack, and all their descendants."""
     above = []
     for joint, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
         if name.startswith(("Spine", "LowerBack")) or parent in above:

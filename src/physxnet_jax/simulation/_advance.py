@@ -1,4 +1,4 @@
-"""The loop over frames, blocks and substeps, whatever the solver."""
+"""The loop over frames, contact intervals and substeps, common to all solvers."""
 
 import dataclasses
 import functools
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._effect import Clock, Placed
+from ._effect import Clock, PosedPoints
 from ._solver import Solver
 from ._state import State, System, place
 
@@ -21,22 +21,22 @@ def start_state(
     solver: Solver,
     fps: float,
 ) -> State:
-    """Cloth from which `advance` goes on; pure and differentiable.
+    """Initial state for `advance`; pure and differentiable.
 
     Args:
-        system: The scene, by `PreparedScene.system` of the solver.
-        position: Cloth [m], garments one after another; people side by side.
-        velocity: Its velocity [m/s]; at rest if omitted.
-        solver: How the cloth will move.
-        fps: Frames a second.
+        system: The scene, from `make_system` with the same solver.
+        position: Cloth positions [m]: garments concatenated, people along the batch axis.
+        velocity: Cloth velocities [m/s]; zero if omitted.
+        solver: Solver that will advance the cloth.
+        fps: Frames per second.
     """
     velocity = jnp.zeros_like(position) if velocity is None else velocity
     return State(
         position,
         velocity,
-        solver.remember(velocity, 1.0 / (fps * solver.substeps)),
-        # Filled in here, or a second call of `advance` would be another program to compile.
-        tuple(e.initial(position.shape[2]) for e in system.effects),
+        solver.init_state(velocity, 1.0 / (fps * solver.substeps)),
+        # Initialised here: with None, the second call of `advance` would have to recompile.
+        tuple(e.init_state(position.shape[2]) for e in system.effects),
     )
 
 
@@ -52,81 +52,95 @@ def advance(
     time: Float[Array, ""] | float = 0.0,
     energies: bool = False,
 ) -> tuple[State, Float[Array, "later vertices 3 batch"], dict[str, Array]]:
-    """Rolls the cloth through frames 1, 2, ... from its state at frame 0.
+    """Advances the cloth through frames 1, 2, ... from its state at frame 0.
 
-    The body moves between frames in a straight line, in as many pieces as there are
-    queries. Differentiable; intermediate values of a frame are recomputed backwards.
+    Skinned points move linearly between frames, split into `Solver.contact_updates`
+    contact intervals. Differentiable; the backward pass recomputes the intermediate
+    values of each frame.
 
     Args:
         system: The scene.
-        state: Cloth at frame 0.
+        state: State at frame 0.
         rotations: Poses of all frames, wxyz.
         root: Hips positions of all frames [m].
-        solver: How the cloth moves.
-        fps: Frames a second.
-        time: Of frame 0, for effects that depend on it [s].
-        energies: Give the energy of each effect as well.
+        solver: Solver of the cloth.
+        fps: Frames per second.
+        time: Time of frame 0, for effects that depend on it [s].
+        energies: Also return the energy of each effect.
 
     Returns:
         The last state, positions of frames 1 and later, and diagnostics of each frame.
     """
     effects = system.effects
-    count = solver.substeps // solver.queries
+    count = solver.substeps // solver.contact_updates
     h = 1.0 / (fps * solver.substeps)
     length = count * h
 
-    def skin(q: Array, p: Array) -> tuple[Placed | None, ...]:
+    def skin(q: Array, p: Array) -> tuple[PosedPoints | None, ...]:
         return tuple(
-            None if e.attached is None else place(system.body, system.rest, e.attached, q, p)
+            None
+            if e.skinned_points is None
+            else place(system.body, system.rest, e.skinned_points, q, p)
             for e in effects
         )
 
-    def block(carry: tuple, k: Array) -> tuple[tuple, None]:
-        state, _, _, before, after, began = carry
-        start = jax.tree.map(lambda a, b: a + (k / solver.queries) * (b - a), before, after)
-        end = jax.tree.map(lambda a, b: a + ((k + 1) / solver.queries) * (b - a), before, after)
+    def interval(carry: tuple, k: Array) -> tuple[tuple, None]:
+        state, _, _, before, after, start_time = carry
+        start = jax.tree.map(lambda a, b: a + (k / solver.contact_updates) * (b - a), before, after)
+        end = jax.tree.map(
+            lambda a, b: a + ((k + 1) / solver.contact_updates) * (b - a), before, after
+        )
         base = state.position
-        clock = Clock(began + k * length, length)
+        clock = Clock(start_time + k * length, length)
         contexts = tuple(
             e.begin(base, s, t, clock, m)
-            for e, s, t, m in zip(effects, start, end, state.kept, strict=True)
+            for e, s, t, m in zip(effects, start, end, state.effect_state, strict=True)
         )
-        kept = tuple(e.keep(c) for e, c in zip(effects, contexts, strict=True))
-        d, v, memory = solver.block(system, contexts, state.velocity, state.memory, h, count)
-        return (State(base + d, v, memory, kept), d, contexts, before, after, began), None
+        effect_state = tuple(e.update_state(c) for e, c in zip(effects, contexts, strict=True))
+        d, v, solver_state = solver.advance_interval(
+            system, contexts, state.velocity, state.solver_state, h, count
+        )
+        return (
+            State(base + d, v, solver_state, effect_state),
+            d,
+            contexts,
+            before,
+            after,
+            start_time,
+        ), None
 
     def frame(carry: tuple, pose: tuple[Array, Array]) -> tuple[tuple, tuple]:
-        state, before, began = carry
+        state, before, start_time = carry
         after = skin(*pose)
-        # The loop's carry needs the contexts' shapes; the first block fills them.
+        # The loop's carry needs the contexts' shapes; the first interval fills them.
         shapes = jax.eval_shape(
-            lambda x, at, kept: tuple(
-                e.begin(x, s, s, Clock(began, length), m)
-                for e, s, m in zip(effects, at, kept, strict=True)
+            lambda x, at, effect_state: tuple(
+                e.begin(x, s, s, Clock(start_time, length), m)
+                for e, s, m in zip(effects, at, effect_state, strict=True)
             ),
             state.position,
             before,
-            state.kept,
+            state.effect_state,
         )
         contexts = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-        start = (state, jnp.zeros_like(state.position), contexts, before, after, began)
-        steps = jnp.arange(solver.queries, dtype=state.position.dtype)
-        (state, d, contexts, _, _, _), _ = jax.lax.scan(block, start, steps)
-        info = _look(system, solver, state, d, contexts, h, energies)
-        return (state, after, began + 1.0 / fps), (state.position, info)
+        start = (state, jnp.zeros_like(state.position), contexts, before, after, start_time)
+        steps = jnp.arange(solver.contact_updates, dtype=state.position.dtype)
+        (state, d, contexts, _, _, _), _ = jax.lax.scan(interval, start, steps)
+        info = _diagnose(system, solver, state, d, contexts, h, energies)
+        return (state, after, start_time + 1.0 / fps), (state.position, info)
 
-    if state.kept is None:
-        kept = tuple(e.initial(state.position.shape[2]) for e in effects)
-        state = dataclasses.replace(state, kept=kept)
+    if state.effect_state is None:
+        effect_state = tuple(e.init_state(state.position.shape[2]) for e in effects)
+        state = dataclasses.replace(state, effect_state=effect_state)
     first = skin(rotations[0], root[0])
-    began = jnp.asarray(time, state.position.dtype)
+    start_time = jnp.asarray(time, state.position.dtype)
     (state, _, _), (positions, diagnostics) = jax.lax.scan(
-        jax.checkpoint(frame), (state, first, began), (rotations[1:], root[1:])
+        jax.checkpoint(frame), (state, first, start_time), (rotations[1:], root[1:])
     )
     return state, positions, diagnostics
 
 
-def _look(
+def _diagnose(
     system: System,
     solver: Solver,
     state: State,
@@ -135,14 +149,14 @@ def _look(
     h: float,
     energies: bool,
 ) -> dict[str, Array]:
-    """Diagnostics at a frame's end, shapes [batch]."""
+    """Diagnostics at the end of a frame, shapes [batch]."""
     finite = jnp.isfinite(state.position).all(axis=1)
     speed = jnp.sqrt(jnp.sum(state.velocity**2, axis=1))
-    residual = solver.residual(system, contexts, displacement, state.memory, h)
+    residual = solver.residual(system, contexts, displacement, state.solver_state, h)
     info = {
         "finite": finite.all(axis=0),
         "speed_max": speed.max(axis=0),
-        # A value that isn't finite is the worst of all.
+        # A non-finite vertex counts as the fastest.
         "worst_vertex": jnp.argmax(jnp.where(finite, speed, jnp.inf), axis=0),
         "residual_max": residual.max(axis=0),
         "residual_p99": jnp.sort(residual, axis=0)[int(0.99 * (residual.shape[0] - 1))],

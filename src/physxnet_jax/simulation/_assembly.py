@@ -1,4 +1,4 @@
-"""Garments of a scene as one set of particles and triangles."""
+"""All garments of a scene as one set of particles and triangles."""
 
 import dataclasses
 
@@ -13,10 +13,10 @@ from ..garment import Garment
 
 @dataclasses.dataclass(frozen=True)
 class Assembly:
-    """What effects are built from. Host arrays, made once for a scene.
+    """Input of `Effect.prepare`: host arrays, built once per scene.
 
     Attributes:
-        body: The body worn on.
+        body: The body that wears the garments.
         rest_body: Rest positions of all body vertices [m], shape [all, 3].
         rest: Rest positions of cloth vertices [m], shape [vertices, 3].
         faces: Cloth triangles, shape [faces, 3].
@@ -28,8 +28,8 @@ class Assembly:
         stretch: Membrane stiffness of faces [N/m], shape [faces].
         bend: Bending stiffness of faces [N m], shape [faces].
         membrane: Stiffness along warp, weft and in shear [N/m], shape [faces, 3].
-        loose: Vertices that may meet any limb (skirts), shape [vertices].
-        parts: First vertex of every garment, and the total at the end.
+        loose: Vertices that may touch any limb (skirts), shape [vertices].
+        parts: First vertex of each garment, followed by the number of vertices.
     """
 
     body: Body
@@ -49,7 +49,7 @@ class Assembly:
 
 
 def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " shapes"]) -> Assembly:
-    """Garments at rest on a body, as one system."""
+    """Combines garments at rest on a body into one system."""
     rest_body = body.rest_vertices(shape)
     rest, faces, mass, pinned, weights = [], [], [], [], []
     per_vertex: dict[str, list] = {"thickness": [], "friction": []}
@@ -64,7 +64,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         )
         m = np.zeros(len(x))
         np.add.at(m, f, (g.fabric.density * area / 3)[:, None])
-        # A vertex without area still needs a mass: a thousandth of the mean one.
+        # A vertex without area still needs a mass: a thousandth of the mean.
         m = np.maximum(m, 1e-3 * max(float(m.mean()), 1e-9))
         rest.append(x)
         faces.append(f + parts[-1])
@@ -76,7 +76,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         per_face["stretch"].append(np.full(len(f), g.fabric.stretch))
         per_face["bend"].append(np.full(len(f), g.fabric.bend))
         per_face["membrane"].append(np.tile(g.fabric.membrane, (len(f), 1)))
-        loose.append(_hanging(g, x, np.asarray(rest_body, np.float64)))
+        loose.append(_loose_vertices(g, x, np.asarray(rest_body, np.float64)))
         parts.append(parts[-1] + len(x))
     cat = np.concatenate
     return Assembly(
@@ -98,21 +98,21 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
 
 
 def float32(x: np.ndarray) -> Array:
-    """A device array in the simulation's precision."""
+    """Converts to a float32 device array."""
     return jnp.asarray(np.asarray(x, dtype=np.float32))
 
 
-# Cloth farther than this from the skin hangs [m].
-_HANGS = 0.025
+# Cloth farther than this from the skin counts as loose [m].
+_LOOSE_DISTANCE = 0.025
 
 
-def _hanging(
+def _loose_vertices(
     garment: Garment, x: Float[np.ndarray, "vertices 3"], rest_body: Float[np.ndarray, "all 3"]
 ) -> Bool[np.ndarray, " vertices"]:
-    """Vertices that may meet any limb: of a skirt, or far from the skin."""
-    far = KDTree(rest_body[:NUM_BODY_VERTICES]).query(x)[0] > _HANGS
+    """Vertices that may touch any limb: those of a skirt and those far from the skin."""
+    far = KDTree(rest_body[:NUM_BODY_VERTICES]).query(x)[0] > _LOOSE_DISTANCE
     if garment.template != "dress":
         return far
-    # A skirt hangs from where it leaves the body down to its hem.
+    # A skirt is loose from the height at which it leaves the body down to its hem.
     top = x[far, 1].max() if far.any() else -np.inf
     return far | (x[:, 1] < top)

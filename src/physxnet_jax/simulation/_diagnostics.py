@@ -1,4 +1,4 @@
-"""What a rollout tells about itself."""
+"""Rollouts: cloth positions, diagnostics and status flags."""
 
 import dataclasses
 import enum
@@ -10,12 +10,12 @@ from ..errors import SimulationError
 
 
 class Status(enum.IntFlag):
-    """What was found wrong in a frame; 0 is a frame without complaint."""
+    """Problems found in a frame; 0 means none."""
 
     NONFINITE = 1
     """A NaN or an infinity."""
     UNCONVERGED = 2
-    """Residual of a per cent of the vertices above 1."""
+    """The 99th percentile of the vertices' residuals is above 1."""
     STRAINED = 4
     """An edge longer than 1.5 times its rest length."""
     INSIDE = 8
@@ -25,11 +25,11 @@ class Status(enum.IntFlag):
     FAST = 32
     """A vertex faster than 50 m/s."""
     PINCHED = 64
-    """Cloth that lies within another limb than its own: the body intersects itself."""
+    """Cloth lies inside another limb because the body intersects itself."""
     CROSSED = 128
-    """Layers in the wrong order somewhere."""
+    """Some vertices of two layers are in the wrong order."""
     OVERFLOW = 256
-    """More vertices in one place than self-contact has room for."""
+    """A grid cell of `SelfContact` received more vertices than it can hold."""
 
 
 _STRAIN, _INSIDE, _SPEED = 0.5, 0.01, 50.0
@@ -43,19 +43,18 @@ _CAUSES = {
 
 @dataclasses.dataclass(frozen=True)
 class Rollout:
-    """What a rollout gives.
+    """Result of a simulation.
 
     Attributes:
-        positions: Cloth positions of every garment [m], shapes [frames, vertices, 3].
-        fps: Frames a second.
+        positions: Cloth positions of each garment [m], shapes [frames, vertices, 3].
+        fps: Frames per second.
         diagnostics: Values of each frame: ``finite``, ``speed_max`` [m/s],
             ``worst_vertex`` (the fastest), ``residual_max`` and ``residual_p99``
-            (1 is the tolerance of 0.5 mm), and what the scene's effects add:
-            ``strain_max``, ``strain_p99`` [1], ``penetration_max`` [m],
-            ``inside_share``, ``missed``, ``pinched`` (vertices), ``layers_crossed``,
-            ``layers_depth`` [m], ``self_gap`` [m], ``overflow``; ``energy_...`` [J] if
-            asked for.
-        name: Of the motion.
+            (1 is the tolerance of 0.5 mm). The scene's effects add ``strain_max``,
+            ``strain_p99`` [1], ``penetration_max`` [m], ``inside_share``, ``missed``,
+            ``pinched`` (vertices), ``layers_crossed``, ``layers_depth`` [m],
+            ``self_gap`` [m] and ``overflow``; ``energy_...`` [J] if requested.
+        name: Name of the motion.
     """
 
     positions: tuple[Float[np.ndarray, "frames _ 3"], ...]
@@ -65,17 +64,17 @@ class Rollout:
 
     @property
     def finite(self) -> Bool[np.ndarray, " frames"]:
-        """Which frames hold no NaN and no infinity."""
+        """Which frames contain neither NaN nor infinity."""
         return self.diagnostics["finite"].astype(bool)
 
     @property
     def worst(self) -> dict[str, float]:
-        """Each diagnostic where it is worst: the least gap, the most of all else."""
-        of_a_frame = ("finite", "worst_vertex", "milliseconds")
+        """Worst value of each diagnostic: the minimum of gaps, the maximum of all others."""
+        per_frame = ("finite", "worst_vertex", "milliseconds")
         return {
             k: float(np.min(v) if k == "self_gap" else np.max(v))
             for k, v in self.diagnostics.items()
-            if k not in of_a_frame
+            if k not in per_frame
         }
 
     @property
@@ -103,8 +102,8 @@ class Rollout:
         """Raises if a frame isn't finite.
 
         Raises:
-            SimulationError: Frame, vertex and the likely cause: what the frames before
-                complained of.
+            SimulationError: A frame isn't finite. The message names the frame, the vertex
+                and the likely causes, taken from the status of the preceding frames.
         """
         if self.finite.all():
             return
@@ -115,5 +114,5 @@ class Rollout:
         raise SimulationError(
             f"{self.name or 'motion'}: frame {frame}, vertex {vertex} is not finite; likely"
             f" {' or '.join(likely[:2] or ['a value in the input that is not finite'])}."
-            " Try accuracy='fine'; see Rollout.status of the frames before."
+            " Try accuracy='fine'; see Rollout.status of the preceding frames."
         )

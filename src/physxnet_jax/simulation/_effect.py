@@ -1,4 +1,4 @@
-"""What an effect is: an entry of a scene that leaves no trace when absent."""
+"""The interface of effects: the forces and constraints that a scene lists."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,8 +13,8 @@ from ._assembly import Assembly
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class Attached:
-    """Points that an effect needs skinned with the body.
+class SkinnedPoints:
+    """Points to be skinned with the body for an effect, at rest.
 
     Attributes:
         rest: Rest positions [m], shape [points, 3].
@@ -29,12 +29,12 @@ class Attached:
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class Placed:
-    """Attached points at one moment.
+class PosedPoints:
+    """Skinned points at one time.
 
     Attributes:
         points: Positions [m], shape [points, 3, batch].
-        normals: Normals, nearly unit, shape [points, 3, batch].
+        normals: Normals of almost unit length, shape [points, 3, batch].
     """
 
     points: Float[Array, "points 3 batch"]
@@ -44,11 +44,11 @@ class Placed:
 @pytree
 @dataclasses.dataclass(frozen=True)
 class Clock:
-    """When a block takes place.
+    """Start and length of a contact interval.
 
     Attributes:
-        time: Since the clip's first frame, at the block's start [s].
-        length: Of the block [s].
+        time: Start of the interval, relative to the clip's first frame [s].
+        length: Length of the interval [s].
     """
 
     time: Float[Array, ""]
@@ -56,36 +56,36 @@ class Clock:
 
 
 class Prepared:
-    """An effect made ready for a scene: a pytree with hooks that default to nothing.
+    """An effect prepared for a scene: a pytree whose hooks do nothing by default.
 
-    A block is a stretch of time within a frame over which queries are kept. Its
-    ``base`` are the cloth's positions at its start; ``displacement`` is relative to
-    them, which keeps float32 exact far from the origin. The batch of actions is the
-    minor axis everywhere: gathers move whole rows, element-wise work is contiguous.
+    A contact interval is a part of a frame during which the results of contact searches
+    are reused. ``base`` holds the cloth positions at its start; ``displacement`` is
+    relative to them, which keeps float32 accurate far from the origin. The batch is the
+    last axis everywhere: gathers move whole rows, element-wise work is contiguous.
     """
 
-    # Whether it stores energy; what doesn't is projected by every solver.
+    # Whether the effect stores energy; every solver projects those that don't.
     elastic: ClassVar[bool] = False
-    # Whether it prescribes where vertices are.
-    holds: ClassVar[bool] = False
-    # Which factors of `System.rescaled` it knows.
+    # Whether the effect prescribes vertex positions.
+    kinematic: ClassVar[bool] = False
+    # Factors of `System.rescaled` that apply to the effect.
     materials: ClassVar[tuple[str, ...]] = ()
 
     @property
-    def attached(self) -> Attached | None:
-        """Points to be skinned for this effect, if it needs any."""
+    def skinned_points(self) -> SkinnedPoints | None:
+        """Points to be skinned for this effect, or None."""
         return None
 
     def rescaled(self, factors: Mapping[str, Any]) -> "Prepared":
-        """The effect with material parameters multiplied, see `System.rescaled`."""
+        """The effect with scaled material parameters, see `System.rescaled`."""
         return self
 
-    def initial(self, batch: int) -> Any:
-        """What the effect remembers before the first block (a pytree)."""
+    def init_state(self, batch: int) -> Any:
+        """Effect state before the first contact interval (a pytree)."""
         return ()
 
-    def keep(self, context: Any) -> Any:
-        """What it remembers for the next block, of the same structure."""
+    def update_state(self, context: Any) -> Any:
+        """Effect state for the next contact interval, with the same structure."""
         return ()
 
     def begin(
@@ -94,23 +94,23 @@ class Prepared:
         start: Any,
         end: Any,
         clock: Clock,
-        memory: Any,
+        state: Any,
     ) -> Any:
-        """What the other hooks need for a block (a pytree; None for nothing).
+        """Context of a contact interval for the other hooks (a pytree, or None).
 
         Args:
-            base: Cloth positions at the block's start [m].
-            start: The attached points at the block's start, a `Placed` or None.
-            end: The same at its end.
-            clock: Time at the block's start.
-            memory: What `keep` returned for the block before.
+            base: Cloth positions at the start of the interval [m].
+            start: Skinned points at the start of the interval, a `PosedPoints` or None.
+            end: Skinned points at its end.
+            clock: Start and length of the interval.
+            state: Result of `update_state` for the previous interval.
         """
         return None
 
     def accelerate(
         self, velocity: Float[Array, "vertices 3 batch"], context: Any, h: float
     ) -> Float[Array, "vertices 3 batch"]:
-        """Velocities [m/s] after external forces have acted for ``h`` [s]."""
+        """Velocities [m/s] after external forces have acted for a time ``h`` [s]."""
         return velocity
 
     def energy(
@@ -120,17 +120,17 @@ class Prepared:
         return None
 
     def coupled(self) -> Int[np.ndarray, "blocks 2"]:
-        """Pairs of vertices that the energy's second derivative couples."""
+        """Pairs of vertices that the Hessian of the energy couples."""
         return np.zeros((0, 2), np.int64)
 
     def hessian(
         self, displacement: Float[Array, "vertices 3 batch"], context: Any
     ) -> Float[Array, "blocks batch 3 3"] | None:
-        """Its blocks [N/m], made positive semidefinite, in the order of `coupled`."""
+        """Blocks of the Hessian [N/m], made positive semidefinite, in the order of `coupled`."""
         return None
 
     def constant_stiffness(self) -> Float[Array, " blocks"] | None:
-        """Blocks that are constant multiples of the identity [N/m], likewise."""
+        """Factors of blocks that are constant multiples of the identity [N/m], likewise."""
         return None
 
     def project(
@@ -141,28 +141,28 @@ class Prepared:
         progress: Float[Array, ""],
         step: tuple[float, float],
     ) -> Float[Array, "vertices 3 batch"]:
-        """Displacements [m] after the effect's constraints.
+        """Displacements [m] after projection onto the effect's constraints.
 
         Args:
-            displacement: Since the block's start [m].
+            displacement: Displacement since the start of the contact interval [m].
             start: Displacement at the start of this substep [m].
-            context: What `begin` returned.
-            progress: Share of the block done at the end of this substep, 0 to 1.
-            step: The substep [s] and its share of the block.
+            context: Result of `begin`.
+            progress: Fraction of the interval done at the end of this substep, 0 to 1.
+            step: The substep [s] and its fraction of the interval.
         """
         return displacement
 
     def diagnose(
         self, displacement: Float[Array, "vertices 3 batch"], context: Any
     ) -> dict[str, Float[Array, " batch"]]:
-        """Scalars at a frame's end, by name: see `Diagnostics`."""
+        """Named scalars at the end of a frame, see `Rollout`."""
         return {}
 
 
 @dataclasses.dataclass(frozen=True)
 class Effect:
-    """Settings of an effect; `prepare` makes it ready for a scene."""
+    """Settings of an effect; `prepare` applies them to a scene."""
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """The effect for these garments on this body."""
-        raise TypeError(f"{type(self).__name__} doesn't say how it is prepared.")
+        """The prepared effect for these garments on this body."""
+        raise TypeError(f"{type(self).__name__} does not implement prepare().")

@@ -15,23 +15,23 @@ from ._solver import TOLERANCE, Solver, accelerate_all, split, stored_energy
 from ._state import System
 
 if TYPE_CHECKING:
-    from ._scene import PreparedScene
+    from ._prepared_scene import PreparedScene
 
 
 @dataclasses.dataclass(frozen=True)
 class Implicit(Solver):
     """Implicit steps: unconditionally stable for elastic forces, smooth gradients.
 
-    Each Newton step solves a symmetric positive system by preconditioned conjugate
-    gradients; backwards, the same system is solved once more instead of its iterations
-    being unrolled. What only constrains (contact, pins, strain limits) is projected
-    after the solve, which is first order.
+    Each Newton step solves a symmetric positive definite system by preconditioned
+    conjugate gradients. The backward pass solves the same system once more instead of
+    unrolling the iterations. Effects that only constrain (contact, pins, strain limits)
+    are projected after the solve, which is first order.
 
     Attributes:
         order: 1 for backward Euler, 2 for BDF2.
-        newton: Newton steps a substep; 1 is the linearly implicit method.
-        iterations: At most so many conjugate gradient steps.
-        tolerance: They stop at this residual relative to the right-hand side.
+        newton: Newton steps per substep; 1 is the linearly implicit method.
+        iterations: Maximum number of conjugate gradient iterations.
+        tolerance: Residual, relative to the right-hand side, at which they stop.
 
     References:
         Baraff and Witkin, Large steps in cloth simulation (1998); Choi and Ko, Stable
@@ -55,17 +55,17 @@ class Implicit(Solver):
         """The sparsity pattern of the scene's elastic effects."""
         return _pattern(scene)
 
-    def remember(self, velocity: Array, h: float) -> Any:
+    def init_state(self, velocity: Array, h: float) -> Any:
         worst = jnp.zeros((velocity.shape[0], velocity.shape[2]), velocity.dtype)
-        # Without a past, the first step is one of backward Euler.
+        # The first step has no history, so it is a backward Euler step.
         return h * velocity, velocity, worst, jnp.ones((), velocity.dtype)
 
-    def block(
+    def advance_interval(
         self,
         system: System,
         contexts: tuple[Any, ...],
         velocity: Array,
-        memory: Any,
+        solver_state: Any,
         h: float,
         count: int,
     ) -> tuple[Array, Array, Any]:
@@ -78,20 +78,20 @@ class Implicit(Solver):
         def stored(x: Array) -> Array:
             return stored_energy(elastic, x)
 
-        def substep(i: Array, moving: tuple[Array, ...]) -> tuple[Array, ...]:
-            d, v, step, before, _, young = moving
-            two = (1.0 - young) if self.order == 2 else jnp.zeros_like(young)
-            # The factor of the force in the step: x = y + f reach^2 / m.
-            reach = h * (1.0 - two / 3)
-            ahead = v + two * (v - before)
-            push = (accelerate_all(system.effects, contexts, ahead, h) - ahead) / h
-            goal = d + h * v + two * (step / 3 - h * (v + 2 * before) / 9)
-            goal = goal + reach * reach * push
+        def substep(i: Array, carry: tuple[Array, ...]) -> tuple[Array, ...]:
+            d, v, step, before, _, first_step = carry
+            bdf2 = (1.0 - first_step) if self.order == 2 else jnp.zeros_like(first_step)
+            # Effective step: x = y + f reach^2 / m.
+            reach = h * (1.0 - bdf2 / 3)
+            ahead = v + bdf2 * (v - before)
+            acceleration = (accelerate_all(system.effects, contexts, ahead, h) - ahead) / h
+            target = d + h * v + bdf2 * (step / 3 - h * (v + 2 * before) / 9)
+            target = target + reach * reach * acceleration
             progress = (i + 1).astype(d.dtype) * share
-            # Held vertices stand where they are held; the others start where they are.
+            # Initial guess: prescribed positions of held vertices, current ones of the others.
             x = d
             for e, c in rigid:
-                if e.holds:
+                if e.kinematic:
                     x = e.project(x, d, c, progress, (h, share))
             held = x
             worst = jnp.zeros((d.shape[0], d.shape[2]), d.dtype)
@@ -99,27 +99,27 @@ class Implicit(Solver):
 
                 def newton(_: Array, at: tuple[Array, Array]) -> tuple[Array, Array]:
                     x = at[0]
-                    slope = free * (mass * (x - goal) + reach * reach * jax.grad(stored)(x))
+                    gradient = free * (mass * (x - target) + reach * reach * jax.grad(stored)(x))
                     blocks = pattern.assemble(elastic, x, mass, reach)
                     block = pattern.diagonal(blocks, free)
                     stiff = jnp.trace(block, axis1=-2, axis2=-1) / 3
-                    return x - free * self._solve(pattern, blocks, free, slope), stiff
+                    return x - free * self._solve(pattern, blocks, free, gradient), stiff
 
                 x, stiff = jax.lax.fori_loop(0, self.newton, newton, (x, worst))
-                slope = free * (mass * (x - goal) + reach * reach * jax.grad(stored)(x))
-                worst = jnp.sqrt(jnp.sum(slope * slope, axis=1)) / jnp.maximum(stiff, 1e-30)
+                gradient = free * (mass * (x - target) + reach * reach * jax.grad(stored)(x))
+                worst = jnp.sqrt(jnp.sum(gradient * gradient, axis=1)) / jnp.maximum(stiff, 1e-30)
             else:
-                x = jnp.where(free > 0, goal, held)
+                x = jnp.where(free > 0, target, held)
             predicted = x
             for e, c in rigid:
                 x = e.project(x, d, c, progress, (h, share))
-            after = (predicted - d) / h + two * ((predicted - d) - step) / (2 * h)
+            after = (predicted - d) / h + bdf2 * ((predicted - d) - step) / (2 * h)
             new = (x, after + (x - predicted) / h, x - d, v, worst)
-            return *new, jnp.zeros_like(young)
+            return *new, jnp.zeros_like(first_step)
 
-        start = (jnp.zeros_like(velocity), velocity, *memory)
-        d, v, *memory = jax.lax.fori_loop(0, count, substep, start)
-        return d, v, tuple(memory)
+        start = (jnp.zeros_like(velocity), velocity, *solver_state)
+        d, v, *solver_state = jax.lax.fori_loop(0, count, substep, start)
+        return d, v, tuple(solver_state)
 
     def _solve(self, pattern: "Pattern", blocks: Array, free: Array, right: Array) -> Array:
         """Conjugate gradients with the inverse of the diagonal blocks."""
@@ -133,17 +133,17 @@ class Implicit(Solver):
 
         def solve(apply: Any, b: Array) -> Array:
             dot = lambda a, c: jnp.sum(a * c, axis=(0, 1), keepdims=True)  # noqa: E731
-            enough = self.tolerance**2 * dot(b, precondition(b))
+            threshold = self.tolerance**2 * dot(b, precondition(b))
 
-            def going(s: tuple) -> Array:
-                return (s[4] < self.iterations) & jnp.any(s[3] > enough)
+            def unconverged(s: tuple) -> Array:
+                return (s[4] < self.iterations) & jnp.any(s[3] > threshold)
 
             def step(s: tuple) -> tuple:
                 x, r, p, rz, n = s
                 ap = apply(p)
-                curve = dot(p, ap)
-                # A batch member that is done, or breaks down, stands still.
-                alpha = jnp.where(curve > 0, rz / jnp.where(curve > 0, curve, 1.0), 0.0)
+                curvature = dot(p, ap)
+                # A batch member that has converged or broken down keeps its solution.
+                alpha = jnp.where(curvature > 0, rz / jnp.where(curvature > 0, curvature, 1.0), 0.0)
                 x, r = x + alpha * p, r - alpha * ap
                 z = precondition(r)
                 new = dot(r, z)
@@ -152,7 +152,7 @@ class Implicit(Solver):
 
             z = precondition(b)
             state = (jnp.zeros_like(b), b, z, dot(b, z), jnp.zeros((), jnp.int32))
-            return jax.lax.while_loop(going, step, state)[0]
+            return jax.lax.while_loop(unconverged, step, state)[0]
 
         return jax.lax.custom_linear_solve(matvec, right, solve, symmetric=True)
 
@@ -161,22 +161,22 @@ class Implicit(Solver):
         system: System,
         contexts: tuple[Any, ...],
         displacement: Array,
-        memory: Any,
+        solver_state: Any,
         h: float,
     ) -> Array:
-        """How far another Newton step would move each vertex, over the tolerance."""
-        return memory[2] / TOLERANCE
+        """Distance that another Newton step would move each vertex, over the tolerance."""
+        return solver_state[2] / TOLERANCE
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class Pattern:
-    """Where the blocks of the system matrix lie: rows of equal length.
+    """Sparsity pattern of the system matrix in 3x3 blocks, with rows of equal length.
 
     Attributes:
-        neighbour: Vertices coupled to each, itself first, shape [vertices, k].
-        slots: For each elastic effect, the places of its blocks, shape [blocks].
-        constant: Constant multiples of the identity, shape [vertices, k].
+        neighbour: Vertices coupled to each vertex, itself first, shape [vertices, k].
+        slots: Flat positions of the blocks of each elastic effect, shapes [blocks].
+        constant: Sums of constant multiples of the identity, shape [vertices, k].
     """
 
     neighbour: Int[Array, "vertices k"]
@@ -184,7 +184,7 @@ class Pattern:
     constant: Float[Array, "vertices k"]
 
     def rescaled(self, effects: tuple[Prepared, ...]) -> "Pattern":
-        """With the constant blocks of effects whose materials have changed."""
+        """The pattern with the constant blocks of effects with other materials."""
         elastic = [e for e in effects if e.elastic]
         fixed = [e.constant_stiffness() for e in elastic]
         total = jnp.zeros(self.constant.size, self.constant.dtype)
@@ -196,7 +196,7 @@ class Pattern:
     def assemble(
         self, elastic: list, x: Array, mass: Array, reach: Array
     ) -> Float[Array, "vertices batch 3 k3"]:
-        """``M + h'^2 K`` at displacements x, K positive semidefinite."""
+        """``M + h'^2 K`` at displacements x, with K positive semidefinite."""
         rows, k = self.neighbour.shape
         batch = x.shape[2]
         total = jnp.zeros((rows * k, batch, 3, 3), x.dtype)
@@ -213,11 +213,11 @@ class Pattern:
     def apply(self, blocks: Array, p: Array) -> Array:
         """The matrix times a vector of shape [vertices, 3, batch]."""
         rows, k = self.neighbour.shape
-        around = p[self.neighbour].transpose(0, 3, 1, 2).reshape(rows, p.shape[2], 3 * k)
-        return jnp.einsum("vbim,vbm->vib", blocks, around, precision=jax.lax.Precision.HIGHEST)
+        neighbours = p[self.neighbour].transpose(0, 3, 1, 2).reshape(rows, p.shape[2], 3 * k)
+        return jnp.einsum("vbim,vbm->vib", blocks, neighbours, precision=jax.lax.Precision.HIGHEST)
 
     def diagonal(self, blocks: Array, free: Array) -> Float[Array, "vertices batch 3 3"]:
-        """The diagonal blocks; the identity for held vertices, whose own may be singular."""
+        """The diagonal blocks; the identity for held vertices, whose blocks may be singular."""
         eye = jnp.eye(3, dtype=blocks.dtype)[None, None]
         return jnp.where(free[..., None] > 0, blocks[..., :3], eye)
 
@@ -228,19 +228,19 @@ def _pattern(scene: "PreparedScene") -> Pattern:
     pairs = [np.asarray(e.coupled(), np.int64).reshape(-1, 2) for e in elastic]
     own = np.repeat(np.arange(count)[:, None], 2, axis=1)
     every = np.unique(np.concatenate([own, *pairs]), axis=0)
-    # Each row's own block first.
+    # The diagonal block comes first in each row.
     every = every[np.lexsort((every[:, 1], every[:, 0] != every[:, 1], every[:, 0]))]
     start = np.searchsorted(every[:, 0], np.arange(count))
-    place = np.arange(len(every)) - start[every[:, 0]]
-    width = int(place.max()) + 1
+    column = np.arange(len(every)) - start[every[:, 0]]
+    width = int(column.max()) + 1
     neighbour = np.repeat(np.arange(count)[:, None], width, axis=1)
-    neighbour[every[:, 0], place] = every[:, 1]
+    neighbour[every[:, 0], column] = every[:, 1]
     key = every[:, 0] * count + every[:, 1]
     order = np.argsort(key)
 
     def slot(p: np.ndarray) -> np.ndarray:
         at = order[np.searchsorted(key[order], p[:, 0] * count + p[:, 1])]
-        return p[:, 0] * width + place[at]
+        return p[:, 0] * width + column[at]
 
     slots = tuple(jnp.asarray(slot(p)) for p in pairs)
     nothing = jnp.zeros((count, width), jnp.float32)

@@ -1,4 +1,4 @@
-"""Rollouts that go on where they were stopped."""
+"""Storage of unfinished rollouts, so that they can be resumed."""
 
 import contextlib
 import hashlib
@@ -13,21 +13,21 @@ import numpy as np
 
 from .._version import __version__
 from ..errors import SimulationError
-from ..files import whole_file
+from ..files import atomic_write
 
 
 class Resume:
-    """A folder that holds the blocks of a rollout that are done.
+    """A folder with the finished blocks of frames of a rollout.
 
-    Each block is one file, written whole or not at all, with the cloth's state at its
-    end; the folder belongs to one scene, motion and solver, and refuses others.
+    Each block is one file, written atomically, with the cloth's state at its end. The
+    folder belongs to one scene, motion and solver; others are rejected.
 
     Args:
-        folder: Where blocks are kept; made if needed, removed by `finish`.
-        key: What the rollout is, see `fingerprint`.
+        folder: Folder of the blocks; created if needed, removed by `finish`.
+        key: Identifies the rollout, see `fingerprint`.
 
     Raises:
-        SimulationError: The folder holds another rollout, or something else.
+        SimulationError: The folder contains another rollout or other files.
     """
 
     def __init__(self, folder: str | pathlib.Path, key: str) -> None:
@@ -35,52 +35,52 @@ class Resume:
         label = self.folder / "key.txt"
         if label.is_file() and label.read_text() != key:
             raise SimulationError(
-                f"{self.folder} holds an unfinished rollout of another scene, motion or"
-                " setting. Finish that one, or remove the folder."
+                f"{self.folder} contains an unfinished rollout of another scene, motion or"
+                " setting. Finish that rollout, or remove the folder."
             )
         if not label.is_file() and self.folder.is_dir() and any(self.folder.iterdir()):
             raise SimulationError(
-                f"{self.folder} holds files that are no rollout's. Name an empty folder, or none"
-                " that is there."
+                f"{self.folder} contains files that don't belong to a rollout. Choose an empty or"
+                " a new folder."
             )
-        with whole_file(label) as part:
+        with atomic_write(label) as part:
             part.write_text(key)
 
     def load(self, state: Any) -> tuple[Any, list[np.ndarray], list[dict[str, np.ndarray]]]:
-        """The last state (of the given structure), positions and diagnostics of blocks.
+        """The last state (with the given structure), positions and diagnostics of all blocks.
 
         Raises:
-            SimulationError: A damaged block.
+            SimulationError: A block is damaged.
         """
         positions, diagnostics = [], []
         leaves, tree = jax.tree.flatten(state)
         while (path := self._path(len(positions))).is_file():
             try:
                 with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-                    moved = data["positions"]
+                    frames = data["positions"]
                     info = {k[5:]: data[k] for k in data.files if k.startswith("info_")}
                     leaves = [jnp.asarray(data[f"state_{i}"]) for i in range(len(leaves))]
             except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
                 raise SimulationError(
-                    f"{path}: damaged ({type(error).__name__}). Delete it and those after it: the"
-                    " rollout goes on from the block before."
+                    f"{path}: damaged ({type(error).__name__}). Delete it and the blocks after it;"
+                    " the rollout then resumes from the block before."
                 ) from None
-            positions.append(moved)
+            positions.append(frames)
             diagnostics.append(info)
         return jax.tree.unflatten(tree, leaves), positions, diagnostics
 
     def save(
         self, index: int, state: Any, positions: np.ndarray, diagnostics: dict[str, np.ndarray]
     ) -> None:
-        """Keeps one block."""
+        """Writes one block."""
         arrays = {f"state_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
         arrays |= {f"info_{k}": v for k, v in diagnostics.items()}
-        with whole_file(self._path(index)) as part, part.open("wb") as file:
+        with atomic_write(self._path(index)) as part, part.open("wb") as file:
             np.savez(file, allow_pickle=False, positions=positions, **arrays)
 
     def finish(self) -> None:
-        """Removes what was kept, and the folder if nothing else is in it."""
-        # The key last: without it what is left would be refused.
+        """Removes all blocks, and the folder if it is then empty."""
+        # The key goes last: blocks without a key would be rejected.
         for file in (*self.folder.glob("block_*.npz"), self.folder / "key.txt"):
             file.unlink()
         with contextlib.suppress(OSError):
@@ -91,9 +91,9 @@ class Resume:
 
 
 def fingerprint(*trees: Any) -> str:
-    """A hash of pytrees: their arrays and all that is static in them, and what computes them.
+    """A hash of pytrees (arrays and static fields) and of the package's and JAX's versions.
 
-    The same in every process: a rollout goes on in another one.
+    It is the same in every process, so that another process can resume a rollout.
     """
     digest = hashlib.sha256()
     digest.update(f"{__version__} {jax.__version__}".encode())
@@ -103,7 +103,7 @@ def fingerprint(*trees: Any) -> str:
         for x in leaves:
             numbers = np.asarray(x)
             if numbers.dtype == object:
-                # Its bytes would be an address.
+                # The bytes of an object array are addresses.
                 digest.update(repr(x).encode())
             else:
                 digest.update(f"{numbers.dtype} {numbers.shape}".encode())

@@ -1,4 +1,4 @@
-"""Rollouts: a scene through a motion, from rest, frame by frame."""
+"""Rollouts: simulate a scene through a motion, starting at rest."""
 
 import pathlib
 from collections.abc import Callable
@@ -8,36 +8,37 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from .._environment import free_programs
+from .._environment import clear_caches_if_full
 from ..body import Body
 from ..errors import SimulationError
 from ..motion import Motion, animate
 from ._advance import advance, start_state
 from ._assembly import float32
 from ._diagnostics import Rollout
+from ._prepared_scene import PreparedScene
 from ._resume import Resume, fingerprint
-from ._scene import PreparedScene, Scene, prepare_scene
+from ._scene import Scene, make_system, prepare_scene
 from ._solver import Solver
 from ._xpbd import XPBD
 
-# Frames compiled together: clips of any length are cut into blocks of this many.
+# Frames per compiled call: clips of any length are split into blocks of this many frames.
 ROLLOUT_BLOCK = 10
 
 
-def lead_in(body: Body, motion: Motion, *, seconds: float = 1.5, settle: float = 0.4) -> Motion:
-    """Frames that lead from the rest pose smoothly into a clip's first frame.
+def warmup(body: Body, motion: Motion, *, seconds: float = 1.5, settle: float = 0.4) -> Motion:
+    """Warm-up: a smooth transition from the rest pose to a clip's first frame.
 
-    The body stands at the clip's place with its heading, holds the rest pose while the
-    cloth settles, then eases into the first pose.
+    The body has the clip's first position and heading. It holds the rest pose while the
+    cloth settles, then moves smoothly to the first pose.
 
     Args:
         body: The body.
         motion: The clip.
-        seconds: Length of the lead-in [s].
-        settle: Part of it in which the body stands still [s].
+        seconds: Length of the warm-up [s].
+        settle: Part of it in which the body holds the rest pose [s].
 
     Returns:
-        The lead-in alone; its last frame is the clip's first.
+        The warm-up without the clip; its last frame is the clip's first.
     """
     frames = max(2, round(seconds * motion.fps))
     t = np.arange(1, frames + 1) / frames
@@ -54,17 +55,17 @@ def lead_in(body: Body, motion: Motion, *, seconds: float = 1.5, settle: float =
         pair = Rotation.from_quat(np.stack([rest[j], first[j]]), scalar_first=True)
         rotations[:, j] = Slerp([0.0, 1.0], pair)(s).as_quat(scalar_first=True)
     root = np.repeat(np.asarray(motion.root[:1]), frames, axis=0)
-    return Motion(float32(rotations), jnp.asarray(root), motion.fps, f"{motion.name} lead-in")
+    return Motion(float32(rotations), jnp.asarray(root), motion.fps, f"{motion.name} warm-up")
 
 
-ACCURACY: dict[str, Solver] = {
-    "draft": XPBD(substeps=16, queries=2),
-    "standard": XPBD(substeps=32, queries=4),
-    "fine": XPBD(substeps=128, queries=8),
+PRESETS: dict[str, Solver] = {
+    "draft": XPBD(substeps=16, contact_updates=2),
+    "standard": XPBD(substeps=32, contact_updates=4),
+    "fine": XPBD(substeps=128, contact_updates=8),
 }
-"""The one knob, for 30 frames a second; `Solver.at_rate` gives the same for others.
+"""Solvers by accuracy, for 30 frames per second; `Solver.at_rate` converts to other rates.
 
-Cost is proportional to the substeps, the error about inversely.
+The cost is proportional to the number of substeps, the error about inversely proportional.
 """
 
 
@@ -84,27 +85,27 @@ def simulate(
     Args:
         scene: Garments, body and effects.
         motion: The body's motion.
-        accuracy: ``draft``, ``standard`` or ``fine``, see `ACCURACY`.
-        solver: A solver set by hand, instead.
-        progress: Called with frames done and frames in all.
-        energies: Put the energy of each effect into the diagnostics.
-        throw: Raise if a frame isn't finite; otherwise the status tells.
-        resume: Folder in which blocks are kept until all are done, see `simulate_batch`.
+        accuracy: ``draft``, ``standard`` or ``fine``, see `PRESETS`.
+        solver: Overrides the solver of ``accuracy``.
+        progress: Called with the number of frames done and the total.
+        energies: Include the energy of each effect in the diagnostics.
+        throw: Raise if a frame isn't finite; if False, only `Rollout.status` reports it.
+        resume: Folder for finished blocks, see `simulate_batch`.
 
     Returns:
-        Positions of each garment in every frame, and diagnostics. The lead-in from
-        the rest pose is simulated and left out.
+        Positions of each garment in every frame, and diagnostics. The warm-up from
+        the rest pose is simulated but not returned.
 
     Raises:
-        SimulationError: A frame that isn't finite; its number, the vertex and the
-            likely cause are named.
+        SimulationError: A frame isn't finite; the message names the frame, the vertex
+            and the likely cause. Or ``accuracy`` is unknown.
     """
-    if accuracy not in ACCURACY:
-        raise SimulationError(f"No accuracy '{accuracy}'; there are {', '.join(ACCURACY)}.")
+    if accuracy not in PRESETS:
+        raise SimulationError(f"Unknown accuracy '{accuracy}'; choose {', '.join(PRESETS)}.")
     out = simulate_batch(
         prepare_scene(scene),
         [motion],
-        solver=ACCURACY[accuracy].at_rate(motion.fps) if solver is None else solver,
+        solver=PRESETS[accuracy].at_rate(motion.fps) if solver is None else solver,
         progress=progress,
         energies=energies,
         resume=resume,
@@ -123,29 +124,29 @@ def simulate_batch(
     energies: bool = False,
     resume: str | pathlib.Path | None = None,
 ) -> list[Rollout]:
-    """Several motions side by side; each result is cut to its motion's length.
+    """Simulates several motions as one batch; each result has its motion's length.
 
     Args:
-        scene: The scene, prepared.
-        motions: Clips of one frame rate. Shorter ones hold their last pose.
-        solver: How the cloth moves; ``standard`` by default.
-        progress: Called with frames done and frames in all.
-        energies: Put the energy of each effect into the diagnostics.
-        resume: Folder that keeps what is done: the same call goes on from there after
-            it was stopped, and removes it at the end. None keeps nothing.
+        scene: The prepared scene.
+        motions: Clips with the same frame rate. Shorter ones hold their last pose.
+        solver: Solver of the cloth; ``standard`` by default.
+        progress: Called with the number of frames done and the total.
+        energies: Include the energy of each effect in the diagnostics.
+        resume: Folder for finished blocks. The same call resumes from them after an
+            interruption and removes them at the end. If None, nothing is stored.
 
     Returns:
-        One rollout a motion.
+        One rollout per motion.
 
     Raises:
         SimulationError: No motion, motions of different frame rates, or a folder that
             belongs to another rollout.
     """
     if not motions:
-        raise SimulationError("No motion to simulate; give at least one.")
-    free_programs()
-    solver = ACCURACY["standard"].at_rate(motions[0].fps) if solver is None else solver
-    # Only around what is traced and run: the rest of the process keeps its precision.
+        raise SimulationError("No motion to simulate; pass at least one.")
+    clear_caches_if_full()
+    solver = PRESETS["standard"].at_rate(motions[0].fps) if solver is None else solver
+    # Limited to tracing and execution: the rest of the process keeps its precision.
     with jax.enable_x64(solver.precision == "float64"):
         return _roll(scene, motions, solver, progress, energies, resume)
 
@@ -160,19 +161,19 @@ def _roll(
 ) -> list[Rollout]:
     fps = motions[0].fps
     if any(m.fps != fps for m in motions):
-        raise SimulationError("Motions of one batch need one frame rate: resample them.")
-    system = scene.system(solver)
+        raise SimulationError("All motions of a batch need the same frame rate; resample them.")
+    system = make_system(scene, solver)
     body = scene.assembly.body
     rest = float32(scene.assembly.rest_body)
-    leads = [lead_in(body, m) for m in motions]
-    skipped = leads[0].num_frames
+    warmups = [warmup(body, m) for m in motions]
+    warmup_frames = warmups[0].num_frames
     longest = max(m.num_frames for m in motions)
-    total = -(-(skipped + longest - 1) // ROLLOUT_BLOCK) * ROLLOUT_BLOCK + 1
+    total = -(-(warmup_frames + longest - 1) // ROLLOUT_BLOCK) * ROLLOUT_BLOCK + 1
 
     def stack(name: str) -> np.ndarray:
         rows = []
-        for lead, m in zip(leads, motions, strict=True):
-            first = np.asarray(getattr(lead, name))
+        for warmup_motion, m in zip(warmups, motions, strict=True):
+            first = np.asarray(getattr(warmup_motion, name))
             x = np.concatenate([first, np.asarray(getattr(m, name))[1:]])
             rows.append(x[np.minimum(np.arange(total), len(x) - 1)])
         return np.stack(rows, axis=1)
@@ -184,14 +185,14 @@ def _roll(
             rest,
             float32(scene.assembly.rest),
             float32(scene.assembly.weights),
-            Motion(lead.rotations[:1], lead.root[:1], fps),
+            Motion(warmup_motion.rotations[:1], warmup_motion.root[:1], fps),
         )[0]
-        for lead in leads
+        for warmup_motion in warmups
     ]
     x = jnp.stack(start, axis=2).astype(solver.precision)
     state = start_state(system, x, solver=solver, fps=fps)
-    # Time zero is the clip's first frame, whatever the lead-in's length.
-    began = -(skipped - 1) / fps
+    # Time zero is the clip's first frame, whatever the length of the warm-up.
+    start_time = -(warmup_frames - 1) / fps
     store = None
     positions: list[np.ndarray] = []
     diagnostics: list[dict[str, np.ndarray]] = []
@@ -201,17 +202,17 @@ def _roll(
         state, positions, diagnostics = store.load(state)
     for at in range(ROLLOUT_BLOCK * len(positions), total - 1, ROLLOUT_BLOCK):
         part = slice(at, at + ROLLOUT_BLOCK + 1)
-        state, moved, info = advance(
+        state, new_positions, info = advance(
             system,
             state,
             jnp.asarray(rotations[part]),
             jnp.asarray(root[part]),
             solver=solver,
             fps=fps,
-            time=jnp.asarray(began + at / fps, solver.precision),
+            time=jnp.asarray(start_time + at / fps, solver.precision),
             energies=energies,
         )
-        positions.append(np.asarray(moved))
+        positions.append(np.asarray(new_positions))
         diagnostics.append({k: np.asarray(v) for k, v in info.items()})
         if store is not None:
             store.save(len(positions) - 1, state, positions[-1], diagnostics[-1])
@@ -219,13 +220,13 @@ def _roll(
             progress(min(at + ROLLOUT_BLOCK, total - 1), total - 1)
     if store is not None:
         store.finish()
-    # Diagnostics start at frame 1: the rest state has none, so the lead-in covers it.
+    # Diagnostics start at frame 1, as the rest state has none; it belongs to the warm-up.
     every = np.concatenate([np.asarray(x)[None], *positions])
     values = {k: np.concatenate([d[k] for d in diagnostics]) for k in diagnostics[0]}
     out = []
     for b, m in enumerate(motions):
-        frames = slice(skipped - 1, skipped - 1 + m.num_frames)
-        flags = slice(skipped - 2, skipped - 2 + m.num_frames)
+        frames = slice(warmup_frames - 1, warmup_frames - 1 + m.num_frames)
+        flags = slice(warmup_frames - 2, warmup_frames - 2 + m.num_frames)
         garments = zip(scene.assembly.parts, scene.assembly.parts[1:])
         out.append(
             Rollout(

@@ -1,4 +1,4 @@
-"""Scenes: garments on a body, and the effects that act."""
+"""Scenes: garments on a body and the effects that act on them."""
 
 import dataclasses
 from typing import Any
@@ -11,8 +11,9 @@ from jaxtyping import Array, Float
 from ..body import Body, load_body
 from ..errors import SimulationError
 from ..garment import Garment
-from ._assembly import Assembly, assemble, float32
-from ._effect import Effect, Prepared
+from ._assembly import assemble, float32
+from ._effect import Effect
+from ._prepared_scene import PreparedScene
 from ._solver import Solver
 from ._state import System
 from .effects import (
@@ -46,7 +47,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "body_contact": BodyContact,
     "pin": Pin,
 }
-"""Every effect by name, in the order in which they are best applied."""
+"""All effects by name, in the recommended order."""
 
 STANDARD: tuple[Effect, ...] = (
     Gravity(),
@@ -56,11 +57,11 @@ STANDARD: tuple[Effect, ...] = (
     BodyContact(),
     Pin(),
 )
-"""What clothes on a moving person call for, in the order they are applied."""
+"""Default effects for the clothes of a moving person, in their order of application."""
 
 
 def standard_effects(garments: int) -> tuple[Effect, ...]:
-    """`STANDARD`, and contact between layers if more than one garment is worn."""
+    """`STANDARD`, with `LayerContact` if there is more than one garment."""
     if garments < 2:
         return STANDARD
     at = [type(e) for e in STANDARD].index(BodyContact)
@@ -72,12 +73,12 @@ class Scene:
     """Garments worn on a body.
 
     Attributes:
-        garments: What is worn, the innermost first: with `LayerContact` each stays
-            over the ones before it, without it they don't touch.
-        effects: What acts, in this order within a substep. An effect that isn't
+        garments: Garments, innermost first. With `LayerContact` each stays over the
+            ones before it; without it they don't interact.
+        effects: Effects, applied in this order within a substep. An effect that isn't
             listed isn't computed.
         body: The body; the built-in one if None.
-        shape: Its shape parameters; the default if None.
+        shape: Shape parameters of the body; the default if None.
     """
 
     garments: tuple[Garment, ...]
@@ -86,34 +87,8 @@ class Scene:
     shape: Float[Array, " shapes"] | None = None
 
 
-@dataclasses.dataclass(frozen=True)
-class PreparedScene:
-    """A scene ready to roll: host tables and device arrays.
-
-    Attributes:
-        assembly: Garments as one set of particles, on the host.
-        effects: Prepared effects.
-        inverse_mass: [1/kg], 0 where held, shape [vertices, 1, 1].
-    """
-
-    assembly: Assembly
-    effects: tuple[Prepared, ...]
-    inverse_mass: Float[Array, "vertices 1 1"]
-
-    def system(self, solver: Solver) -> System:
-        """The scene on the device, in the solver's precision."""
-        system = System(
-            self.assembly.body,
-            float32(self.assembly.rest_body),
-            self.effects,
-            self.inverse_mass,
-            solver.prepare(self),
-        )
-        return cast(system, solver.precision)
-
-
 def cast(tree: Any, precision: str) -> Any:
-    """Floating arrays of a pytree in another precision."""
+    """Casts the floating-point arrays of a pytree."""
     dtype = jnp.dtype(precision)
 
     def one(x: Any) -> Any:
@@ -124,7 +99,7 @@ def cast(tree: Any, precision: str) -> Any:
 
 
 def prepare_scene(scene: Scene) -> PreparedScene:
-    """Builds everything a rollout needs, once.
+    """Builds everything that rollouts of a scene need.
 
     Raises:
         SimulationError: No garment, or the same effect twice.
@@ -134,14 +109,26 @@ def prepare_scene(scene: Scene) -> PreparedScene:
     kinds = [type(e) for e in scene.effects]
     if len(set(kinds)) != len(kinds):
         raise SimulationError(
-            f"An effect is listed twice: {[k.__name__ for k in kinds]}. List each once."
+            f"An effect is listed twice: {[k.__name__ for k in kinds]}. List each only once."
         )
     body = load_body() if scene.body is None else scene.body
     shape = body.default_shape() if scene.shape is None else scene.shape
     assembly = assemble(scene.garments, body, shape)
-    # Pinned vertices weigh infinitely much only where something pins them.
+    # Pinned vertices have infinite mass only if the scene has `Pin`.
     held = assembly.pinned if Pin in kinds else np.zeros_like(assembly.pinned)
     inverse = np.where(held, 0.0, 1.0 / assembly.mass)
     inverse_mass = jnp.asarray(inverse.astype(np.float32))
     prepared = tuple(e.prepare(assembly, inverse_mass) for e in scene.effects)
     return PreparedScene(assembly, prepared, inverse_mass[:, None, None])
+
+
+def make_system(scene: PreparedScene, solver: Solver) -> System:
+    """Moves a scene to the device, in the solver's precision."""
+    system = System(
+        scene.assembly.body,
+        float32(scene.assembly.rest_body),
+        scene.effects,
+        scene.inverse_mass,
+        solver.prepare(scene),
+    )
+    return cast(system, solver.precision)

@@ -1,94 +1,96 @@
-"""What a solver is: how a block of substeps moves the cloth."""
+"""The interface of solvers, which advance the cloth by one contact interval."""
 
 import abc
 import dataclasses
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..errors import check_counts
 from ._effect import Prepared
+from ._prepared_scene import PreparedScene
 from ._state import System
 
-if TYPE_CHECKING:
-    from ._scene import PreparedScene
-
-# A residual of 1: another sweep would move the worst vertex by this much [m].
+# At a residual of 1, another sweep would move the worst vertex by this much [m].
 TOLERANCE = 5e-4
-# Frames a second that substeps and queries are stated for.
+# Frames per second that `substeps` and `contact_updates` refer to.
 _RATE = 30.0
 
 
 @dataclasses.dataclass(frozen=True)
 class Solver(abc.ABC):
-    """Settings that every solver has.
+    """Settings common to all solvers.
 
     Attributes:
-        substeps: Steps a frame.
-        queries: Blocks a frame: how often contact looks for the closest skin.
+        substeps: Steps per frame.
+        contact_updates: Contact intervals per frame: number of searches for contacts.
         precision: ``float32``, or ``float64`` for references.
     """
 
     substeps: int = 32
-    queries: int = 4
+    contact_updates: int = 4
     precision: str = "float32"
 
     def __post_init__(self) -> None:
-        check_counts(self, "substeps", "queries")
-        if self.substeps % self.queries:
+        check_counts(self, "substeps", "contact_updates")
+        if self.substeps % self.contact_updates:
             raise ValueError(
-                f"substeps {self.substeps} must be a positive multiple of queries {self.queries}."
+                f"substeps {self.substeps} must be a positive multiple of contact_updates"
+                f" {self.contact_updates}."
             )
         if self.precision not in ("float32", "float64"):
             raise ValueError(f"precision {self.precision!r} is neither float32 nor float64.")
 
     def at_rate(self, fps: float) -> "Solver":
-        """These settings, meant for 30 frames a second, for motion of another rate.
+        """Converts these settings from 30 frames per second to another frame rate.
 
-        Blocks and substeps keep their length; a frame has at least one block.
+        Contact intervals and substeps keep their length, up to rounding; a frame has at
+        least one contact interval.
 
         Args:
-            fps: Frames a second of the motion.
+            fps: Frames per second of the motion.
 
         >>> from physxnet_jax.simulation import XPBD
-        >>> XPBD(substeps=32, queries=4).at_rate(10.0).substeps
+        >>> XPBD(substeps=32, contact_updates=4).at_rate(10.0).substeps
         96
         """
-        each = self.substeps // self.queries
-        queries = max(1, round(self.queries * _RATE / fps))
-        return dataclasses.replace(self, substeps=each * queries, queries=queries)
+        each = self.substeps // self.contact_updates
+        contact_updates = max(1, round(self.contact_updates * _RATE / fps))
+        return dataclasses.replace(
+            self, substeps=each * contact_updates, contact_updates=contact_updates
+        )
 
-    def prepare(self, scene: "PreparedScene") -> Any:
-        """Tables the solver needs for a scene (a pytree), made once on the host."""
+    def prepare(self, scene: PreparedScene) -> Any:
+        """Tables that the solver needs for a scene (a pytree), built once on the host."""
         return None
 
-    def remember(self, velocity: Float[Array, "vertices 3 batch"], h: float) -> Any:
-        """What `State.memory` holds at the start."""
+    def init_state(self, velocity: Float[Array, "vertices 3 batch"], h: float) -> Any:
+        """Initial value of `State.solver_state`."""
         return ()
 
     @abc.abstractmethod
-    def block(
+    def advance_interval(
         self,
         system: System,
         contexts: tuple[Any, ...],
         velocity: Float[Array, "vertices 3 batch"],
-        memory: Any,
+        solver_state: Any,
         h: float,
         count: int,
     ) -> tuple[Array, Array, Any]:
-        """Moves the cloth through a block.
+        """Advances the cloth by one contact interval.
 
         Args:
             system: The scene.
-            contexts: What the effects' `begin` returned.
-            velocity: At the block's start [m/s].
-            memory: As `remember` returned it, or the block before.
-            h: Substep [s].
-            count: Substeps of the block.
+            contexts: Results of the effects' `begin`.
+            velocity: Velocity at the start of the interval [m/s].
+            solver_state: Result of `init_state` or of the previous interval.
+            h: Length of a substep [s].
+            count: Number of substeps.
 
         Returns:
-            Displacement over the block [m], velocity at its end, and the memory.
+            Displacement over the interval [m], velocity at its end, and the solver state.
         """
 
     def residual(
@@ -96,15 +98,15 @@ class Solver(abc.ABC):
         system: System,
         contexts: tuple[Any, ...],
         displacement: Float[Array, "vertices 3 batch"],
-        memory: Any,
+        solver_state: Any,
         h: float,
     ) -> Float[Array, "vertices batch"]:
-        """How far each vertex is from where the constraints want it, over the tolerance."""
+        """Distance that another sweep would move each vertex, over the tolerance."""
         moved = project_all(
             system.effects, contexts, displacement, displacement, jnp.ones(()), (h, 0.0)
         )
-        gap = moved - displacement
-        return jnp.sqrt(jnp.sum(gap * gap, axis=1)) / TOLERANCE
+        correction = moved - displacement
+        return jnp.sqrt(jnp.sum(correction * correction, axis=1)) / TOLERANCE
 
 
 def project_all(
@@ -134,13 +136,13 @@ def accelerate_all(
 def split(
     effects: tuple[Prepared, ...], contexts: tuple[Any, ...]
 ) -> tuple[list[tuple[Prepared, Any]], list[tuple[Prepared, Any]]]:
-    """Effects that store energy, and those that only constrain, with their contexts."""
+    """Effects that store energy and effects that only constrain, with their contexts."""
     pairs = list(zip(effects, contexts, strict=True))
     return [p for p in pairs if p[0].elastic], [p for p in pairs if not p[0].elastic]
 
 
 def stored_energy(elastic: list[tuple[Prepared, Any]], displacement: Array) -> Array:
-    """Energy of all effects and batch members together [J]: its gradient is the force."""
+    """Total energy of all effects and batch members [J]; its negative gradient is the force."""
     total = jnp.zeros((), displacement.dtype)
     for e, context in elastic:
         energy = e.energy(displacement, context)

@@ -1,16 +1,7 @@
 """Training: losses, step, loop, checkpoints."""
 
-from ._batches import (
-    Frames as Frames,
-    batch_indices as batch_indices,
-    load_frames as load_frames,
-    take as take,
-    teaches as teaches,
-    usable_garment as usable_garment,
-)
-from ._checkpoint import Checkpoints as Checkpoints
 from ._config import TrainConfig as TrainConfig
-from ._loop import prepare_surface as prepare_surface, train as train
+from ._loop import prepare_targets as prepare_targets, train as train
 from ._losses import (
     adversarial_loss as adversarial_loss,
     discriminator_loss as discriminator_loss,
@@ -20,15 +11,16 @@ from ._losses import (
     soft_labels as soft_labels,
     vertex_loss as vertex_loss,
 )
-from ._optimiser import (
-    make_optimiser as make_optimiser,
-    orthogonalise as orthogonalise,
-    scale_by_orthogonal_momentum as scale_by_orthogonal_momentum,
+from ._monitor import map_picture as map_picture, read_metrics as read_metrics
+from ._optimizer import (
+    make_optimizer as make_optimizer,
+    orthogonalize_via_newton_schulz as orthogonalize_via_newton_schulz,
+    scale_by_muon as scale_by_muon,
 )
-from ._step import (
-    ClothTables as ClothTables,
-    Steps as Steps,
-    TrainState as TrainState,
-    make_step as make_step,
+from ._problem import (
+    LossInputs as LossInputs,
+    Problem as Problem,
+    configured_loss as configured_loss,
+    make_problem as make_problem,
 )
-from ._watch import map_picture as map_picture, read_metrics as read_metrics
+from ._step import eval_step as eval_step, train_step as train_step

@@ -1,4 +1,4 @@
-"""Checkpoints through orbax: the whole state, resumed exactly."""
+"""Checkpoints through orbax: the whole state is saved, so that runs resume exactly."""
 
 import dataclasses
 import json
@@ -9,15 +9,15 @@ import jax
 import orbax.checkpoint as ocp
 
 from ..errors import PhysXNetError
-from ._step import TrainState
+from ._problem import TrainState
 
 
 class Checkpoints:
     """The checkpoints of one run.
 
     Args:
-        folder: Where they lie; made if absent.
-        keep: How many of the newest are kept.
+        folder: Their folder; created if absent.
+        keep: Number of newest checkpoints to keep.
     """
 
     def __init__(self, folder: str | pathlib.Path, *, keep: int = 2) -> None:
@@ -29,10 +29,10 @@ class Checkpoints:
         )
 
     def save(self, state: TrainState, info: dict[str, Any]) -> None:
-        """Saves a state under its step number; whole or not at all.
+        """Saves a state under its step number, atomically.
 
         Raises:
-            PhysXNetError: A later state lies there.
+            PhysXNetError: A later checkpoint exists.
         """
         if self._manager.latest_step() == int(state.step):
             return
@@ -45,48 +45,48 @@ class Checkpoints:
         self._manager.wait_until_finished()
         if not saved:
             raise PhysXNetError(
-                f"{self._manager.directory}: step {int(state.step)} wasn't saved, step"
-                f" {self._manager.latest_step()} lies there. Delete it, or choose another folder."
+                f"{self._manager.directory}: step {int(state.step)} wasn't saved, because step"
+                f" {self._manager.latest_step()} exists. Delete it, or choose another folder."
             )
 
     def forget_after(self, step: int) -> None:
-        """Removes states of later steps: a run that was killed will do those again."""
+        """Deletes checkpoints of later steps: a resumed run repeats those steps."""
         for later in self._manager.all_steps():
             if later > step:
                 self._manager.delete(later)
 
     def latest(self, like: TrainState) -> TrainState | None:
-        """The newest state, shaped as ``like``; None if there is none.
+        """The newest state, structured like ``like``; None if there is none.
 
         Raises:
-            PhysXNetError: A damaged one.
+            PhysXNetError: The checkpoint is damaged.
         """
         step = self._manager.latest_step()
         if step is None:
             return None
         abstract = jax.tree.map(ocp.utils.to_shape_dtype_struct, _plain(like))
-        wanted = ocp.args.Composite(state=ocp.args.StandardRestore(abstract))
+        request = ocp.args.Composite(state=ocp.args.StandardRestore(abstract))
         try:
-            got = self._manager.restore(step, args=wanted)
-        # Files are read by several libraries, each with errors of its own.
+            restored = self._manager.restore(step, args=request)
+        # Several libraries read the files, each with its own exception types.
         except Exception as error:
             raise PhysXNetError(
-                f"{self._manager.directory}/{step}: the state there is damaged"
-                f" ({type(error).__name__}). Delete that folder: the run goes on from the one"
-                " before."
+                f"{self._manager.directory}/{step}: the checkpoint is damaged"
+                f" ({type(error).__name__}). Delete that folder: the run resumes from the"
+                " previous one."
             ) from error
-        return jax.tree.unflatten(jax.tree.structure(like), got["state"])
+        return jax.tree.unflatten(jax.tree.structure(like), restored["state"])
 
     def close(self) -> None:
-        """Waits for what is being written."""
+        """Waits for pending writes and closes the checkpoints."""
         self._manager.close()
 
 
 def _plain(state: TrainState) -> list[Any]:
-    """The leaves in order: their structure comes from the config, not from the disk."""
+    """The leaves in order; their structure comes from the config, not from disk."""
     return jax.tree.leaves(state)
 
 
 def config_json(config: Any, data: str) -> str:
-    """A run as JSON: its frozen config and what it learns from."""
+    """A run as JSON: its config and the identity of its training data."""
     return json.dumps({**dataclasses.asdict(config), "data": data}, indent=1, sort_keys=True)

@@ -1,4 +1,4 @@
-"""What a training run is."""
+"""The configuration of a training run."""
 
 import dataclasses
 from typing import Literal
@@ -9,44 +9,44 @@ from ..models import ModelConfig
 
 @dataclasses.dataclass(frozen=True)
 class TrainConfig:
-    """Settings of a run; the defaults are the paper's where it gives them.
+    """Settings of a training run; defaults are the paper's where it gives them.
 
     Attributes:
         model: The network.
         epochs: Passes over the training frames.
-        batch: Frames a step.
-        learning_rate: Adam's rate for the generator.
-        discriminator_rate: Adam's rate for the discriminator.
-        momentum: Adam's b1; 0.5 is usual beside a discriminator.
-        optimiser: What the generator learns by: ``adam`` (the paper) or ``muon`` for the
-            kernels of its convolutions (their momentum made orthogonal) beside ``adam``
-            for all else, which gets as far in fewer steps.
-        kernel_rate: Muon's rate for those kernels.
-        schedule: ``constant`` (the paper) or ``cosine`` (up over the first 2 % of the
-            run, down to zero over the rest).
+        batch: Frames per step.
+        learning_rate: Adam's learning rate for the generator.
+        discriminator_rate: Adam's learning rate for the discriminator.
+        b1: Adam's b1; 0.5 is usual with a discriminator.
+        optimizer: The generator's optimizer: ``adam`` (the paper) or ``muon``, which
+            orthogonalises the momentum of convolution kernels, uses ``adam`` for all other
+            parameters, and gets as far in fewer steps.
+        muon_learning_rate: Muon's learning rate for those kernels.
+        schedule: ``constant`` (the paper) or ``cosine`` (warmup over the first 2 % of the
+            run, then decay to zero).
         l1_weight: lambda_L1 of equation 2.
-        squared: Errors are squared in place of the paper's absolute ones: where the same
-            motion has several outcomes the network then learns their mean, which is
-            what the root of mean squares asks for.
-        vertex_share: Share of the L1 loss that is taken at the vertices of the templates,
-            where maps are read, instead of at texels: maps then learn to make up for
-            what reading them loses. 0 is the paper's; ``local`` only.
-        edge_share: Share of the loss at vertices that is taken on the differences along
-            the templates' edges, from which strain and folds come.
-        scales: The loss at texels is the mean over this many sizes of maps, each half as
-            wide as the one before; 1 is the paper's.
-        adversarial: Whether there is a discriminator at all.
-        discriminator_width: Channels of its first layer.
-        mirror: Every action is learned from as a mirror shows it, too.
-        seed: Of everything random.
-        precision: Of the network's arithmetic; parameters and losses stay float32.
-        validation: Names of training actions that are kept from training and measured
-            instead; the weights that did best on them are the result. A set that mixes
-            bodies (`DatasetConfig.upper_from`) has their upper bodies under other names.
-        validate_every: Steps between such measurements.
-        patience: Stop after this many measurements without a better one.
+        loss: ``l1``: the paper's absolute errors; ``l2``: squared errors. Where the same
+            motion has several outcomes, the network then learns their mean, which minimises
+            the root mean square error.
+        vertex_share: Share of the loss that is taken at the templates' vertices, where maps
+            are sampled, instead of at texels. Maps then learn to compensate for the sampling
+            error. 0 is the paper's; ``local`` only.
+        edge_share: Share of the loss at vertices that applies to differences along the
+            templates' edges, which determine strain and folds.
+        pyramid_levels: The loss at texels is the mean over this many resolutions of maps, each
+            half the previous one; 1 is the paper's.
+        adversarial: Whether to train with a discriminator.
+        discriminator_width: Channels of the discriminator's first layer.
+        mirror_augmentation: Also train on the mirror image of every action.
+        seed: Seed of all random numbers.
+        precision: Precision of the network's arithmetic; parameters and losses stay float32.
+        validation: Names of training actions that are held out for validation. The weights
+            with the lowest error on them are the result. A dataset that mixes bodies
+            (`DatasetConfig.upper_from`) contains their upper bodies under other names.
+        validate_every: Steps between validations.
+        patience: Stop after this many validations without improvement.
         checkpoint_every: Steps between checkpoints.
-        max_skipped: Non-finite updates in a row before the run gives up.
+        max_skipped: Abort after this many consecutive non-finite updates.
     """
 
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
@@ -54,18 +54,18 @@ class TrainConfig:
     batch: int = 8
     learning_rate: float = 2e-4
     discriminator_rate: float = 2e-4
-    momentum: float = 0.5
-    optimiser: Literal["adam", "muon"] = "adam"
-    kernel_rate: float = 2e-2
+    b1: float = 0.5
+    optimizer: Literal["adam", "muon"] = "adam"
+    muon_learning_rate: float = 2e-2
     schedule: Literal["constant", "cosine"] = "constant"
     l1_weight: float = 100.0
-    squared: bool = False
+    loss: Literal["l1", "l2"] = "l1"
     vertex_share: float = 0.0
     edge_share: float = 0.0
-    scales: int = 1
+    pyramid_levels: int = 1
     adversarial: bool = True
     discriminator_width: int = 16
-    mirror: bool = False
+    mirror_augmentation: bool = False
     seed: int = 0
     precision: Literal["float32", "bfloat16"] = "float32"
     validation: tuple[str, ...] = ()
@@ -77,22 +77,25 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check_counts(self, "epochs", "batch", "discriminator_width", "validate_every")
         check_counts(self, "patience", "checkpoint_every", "max_skipped")
-        check_numbers(self, "learning_rate", "discriminator_rate", "kernel_rate")
+        check_numbers(self, "learning_rate", "discriminator_rate", "muon_learning_rate")
         check_numbers(self, "l1_weight", zero=True)
-        if not 0.0 <= self.momentum < 1.0:
-            raise ValueError(f"momentum is {self.momentum}; it lies from 0 to below 1.")
+        if not 0.0 <= self.b1 < 1.0:
+            raise ValueError(f"b1 is {self.b1}; it must be at least 0 and below 1.")
         if not 0.0 <= self.vertex_share <= 1.0:
-            raise ValueError(f"vertex_share is {self.vertex_share}; it is a share, 0 to 1.")
+            raise ValueError(f"vertex_share is {self.vertex_share}; it must be from 0 to 1.")
         if self.vertex_share and self.model.family != "local":
-            raise ValueError("vertex_share needs the local family; the paper's loss has none.")
+            raise ValueError("vertex_share needs the local family; the paper's has no vertex loss.")
         if not 0.0 <= self.edge_share <= 1.0:
-            raise ValueError(f"edge_share is {self.edge_share}; it is a share, 0 to 1.")
+            raise ValueError(f"edge_share is {self.edge_share}; it must be from 0 to 1.")
         if self.edge_share and not self.vertex_share:
             raise ValueError("edge_share is a share of vertex_share, which is 0.")
-        if self.scales > 1 and self.squared:
-            raise ValueError("scales takes absolute errors, squared takes squares; choose one.")
-        size = self.model.resolution
-        if self.scales < 1 or size % 2 ** (self.scales - 1):
+        if self.pyramid_levels > 1 and self.loss == "l2":
             raise ValueError(
-                f"scales is {self.scales}: at least 1, and maps of {size} must halve that often."
+                "pyramid_levels above 1 needs loss='l1', but loss is 'l2'; choose one."
+            )
+        size = self.model.resolution
+        if self.pyramid_levels < 1 or size % 2 ** (self.pyramid_levels - 1):
+            raise ValueError(
+                f"pyramid_levels is {self.pyramid_levels}; it must be at least 1, and maps of"
+                f" {size} must halve that often."
             )

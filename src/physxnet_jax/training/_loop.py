@@ -1,5 +1,7 @@
-"""The training loop: resumable, logged, and ending in a predictor."""
+"""The training loop: resumable and logged; the result is a predictor."""
 
+import dataclasses
+import functools
 import itertools
 import json
 import pathlib
@@ -10,51 +12,57 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from flax import nnx
 
 from ..body import load_body
-from ..data import Sequence, mirrored_sequence
+from ..data import Frames, Sequence, batch_indices, load_frames, mirrored_sequence, take
 from ..errors import FormatError, PhysXNetError
-from ..files import append_line, whole_file
+from ..files import append_line, atomic_write
 from ..garment import template
 from ..geometry import mesh_edges
-from ..models import ModelConfig, Normalisation, Predictor, Surface, make_surface, make_wearable
-from ..uv import Atlas, bind, garment_map_rows, make_atlas
-from ._batches import (
-    Frames,
-    batch_indices,
-    load_frames,
-    measure_normalisation,
-    take,
-    target_offsets,
+from ..models import (
+    ModelConfig,
+    Normalisation,
+    Predictor,
+    TexelPoints,
+    bind_garment,
+    make_texel_points,
 )
+from ..uv import Atlas, bind, garment_map_rows, make_atlas
 from ._checkpoint import Checkpoints, config_json
 from ._config import TrainConfig
-from ._step import ClothTables, Steps, TrainState, make_step
-from ._watch import METRICS, Board, Players, Validation, read_metrics
+from ._monitor import METRICS, EarlyStopping, GanMonitor, TensorBoardLogger, read_metrics
+from ._problem import ClothTables, Loss, Problem, TrainState, make_problem
+from ._step import eval_step, train_step
+from ._targets import measure_normalisation, target_offsets
+
+_Report = Callable[[int, int, dict[str, float]], None]
 
 
-def prepare_surface(model: ModelConfig) -> tuple[Atlas, Surface, dict[str, ClothTables]]:
-    """Atlas, texels and target tables of a model's templates on the default body."""
+def prepare_targets(model: ModelConfig) -> tuple[Atlas, TexelPoints, dict[str, ClothTables]]:
+    """Atlas, texel points and target tables of a model's templates on the default body."""
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
     atlas = make_atlas(model.resolution)
     garments = {t: template(t) for t in model.templates}  # pyright: ignore[reportArgumentType]
     rows = {t: garment_map_rows(atlas, body, rest, g) for t, g in garments.items()}
-    surface = make_surface(atlas, body, rest, {t: r.valid for t, r in rows.items()})
+    texel_points = make_texel_points(atlas, body, rest, {t: r.valid for t, r in rows.items()})
     tables = {
         t: ClothTables(
-            rows[t],
-            g.rest_vertices(rest),
-            g.skin,
-            surface.rest_dress if t == "dress" else surface.rest,
-            surface.weights,
-            make_wearable(body, rest, g, bind(atlas, body, rest, g, rows[t].valid)),
-            jnp.asarray(mesh_edges(np.asarray(g.mesh.faces)).vertices),
+            to_cloth=rows[t],
+            rest=g.rest_vertices(rest),
+            skin=g.skin,
+            anchor=texel_points.rest_dress if t == "dress" else texel_points.rest,
+            anchor_weights=texel_points.weights,
+            bound=bind_garment(
+                body, rest, g, bind(g, atlas=atlas, body=body, rest=rest, valid=rows[t].valid)
+            ),
+            edges=jnp.asarray(mesh_edges(np.asarray(g.mesh.faces)).vertices),
         )
         for t, g in garments.items()
     }
-    return atlas, surface, tables
+    return atlas, texel_points, tables
 
 
 def train(
@@ -62,104 +70,196 @@ def train(
     sequences: Items[Sequence],
     folder: str | pathlib.Path,
     *,
+    network: nnx.Module | None = None,
+    loss: Loss | None = None,
+    optimizer: optax.GradientTransformation | None = None,
     steps: int | None = None,
-    report: Callable[[int, int, dict[str, float]], None] | None = None,
+    report: _Report | None = None,
 ) -> Predictor:
-    """Trains a network, or goes on where the run in a folder stopped.
+    """Trains a network, or resumes the run in a folder.
 
     Args:
-        config: The run.
-        sequences: What to learn from.
-        folder: Checkpoints and ``metrics.jsonl`` go here.
-        steps: Stop after this many steps in all instead of all epochs (the learning
+        config: Settings of the run.
+        sequences: Simulated actions, including those of ``config.validation``.
+        folder: Folder for checkpoints and ``metrics.jsonl``.
+        network: Any module with the signature of `Generator`; a `Generator` by default.
+        loss: Any function of `LossInputs`; `configured_loss` by default.
+        optimizer: Any transformation of the generator's gradients; `make_optimizer` by default.
+            Non-finite updates are skipped.
+        steps: Stop after this many steps in total instead of all epochs (the learning
             rate still follows the full length).
-        report: Called with steps done, steps in all and the newest metrics.
+        report: Callback that takes the steps done, the total steps and the newest metrics.
 
     Returns:
         The trained predictor.
 
     Raises:
-        PhysXNetError: Too many updates in a row that aren't finite.
-        FormatError: Nothing usable to learn from or to validate on.
+        PhysXNetError: Too many consecutive non-finite updates, or the folder holds another run.
+        FormatError: No usable data for training or validation.
     """
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    data = _load_data(config, sequences)
+    total = max(len(data.frames) // config.batch, 1) * config.epochs
+    problem, first = make_problem(
+        config,
+        data.atlas,
+        data.texel_points,
+        data.normalisation,
+        data.tables,
+        fps=data.frames.fps,
+        steps=total,
+        network=network,
+        loss=loss,
+        optimizer=optimizer,
+    )
+    _check_same_run(folder / "config.json", config_json(config, data.frames.identity))
+    run = _Run(folder, problem, first, data, total)
+    try:
+        run.train(total if steps is None else min(steps, total), report)
+    finally:
+        run.close()
+    return make_predictor(problem, run.best())
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Data:
+    """Frames to learn from, and the tables and scales that come with them."""
+
+    frames: Frames
+    unseen: Frames | None
+    atlas: Atlas
+    texel_points: TexelPoints
+    tables: dict[str, ClothTables]
+    normalisation: Normalisation
+
+
+def _load_data(config: TrainConfig, sequences: Items[Sequence]) -> _Data:
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
-    atlas, surface, tables = prepare_surface(config.model)
+    atlas, texel_points, tables = prepare_targets(config.model)
     garments = {t: template(t) for t in config.model.templates}  # pyright: ignore[reportArgumentType]
     held = _held_out(config, sequences)
     used = [s for s in sequences if s.name not in config.validation]
     # One at a time: each is as large as its original.
-    images = (mirrored_sequence(body, s) for s in used if config.mirror)
-    frames = load_frames(itertools.chain(used, images), garments, body, rest, config.model.inputs)
-    unseen = load_frames(held, garments, body, rest, config.model.inputs) if held else None
+    images = (mirrored_sequence(body, s) for s in used if config.mirror_augmentation)
+    load = functools.partial(
+        load_frames,
+        garments=garments,
+        body=body,
+        rest=rest,
+        window=config.model.inputs.window,
+        local=config.model.family == "local",
+    )
+    frames = load(itertools.chain(used, images))
+    unseen = load(held) if held else None
     if unseen is not None and not any(x.any() for x in unseen.usable.values()):
         raise FormatError(
             f"no usable cloth in {', '.join(config.validation)}: validate on another action."
         )
-    normalisation = _normalisation(config, frames, surface, tables)
-    per_epoch = max(len(frames) // config.batch, 1)
-    total = per_epoch * config.epochs
-    stop = total if steps is None else min(steps, total)
-    run = make_step(config, atlas, surface, normalisation, tables, frames.fps, total)
-    _same_run(folder / "config.json", config_json(config, frames.identity))
-    checkpoints = Checkpoints(folder / "checkpoints")
-    best_kept = Checkpoints(folder / "best", keep=1)
-    restored = checkpoints.latest(run.first)
-    state = run.first if restored is None else restored
-    done = int(state.step)
-    best_kept.forget_after(done)
-    noted = read_metrics(folder)
-    watch = Validation(noted, done, config.patience)
-    players = Players(noted, done)
-    key = jax.random.key(config.seed)
-    board = Board(folder)
-    began = time.perf_counter()
+    return _Data(
+        frames=frames,
+        unseen=unseen,
+        atlas=atlas,
+        texel_points=texel_points,
+        tables=tables,
+        normalisation=_normalisation(config, frames, texel_points, tables),
+    )
 
-    def note(values: dict[str, float]) -> None:
-        values |= {"step": done, "seconds": round(time.perf_counter() - began, 3)}
-        append_line(folder / METRICS, values)
-        board.write(values, done)
-        if report is not None:
-            report(done, stop, values)
 
-    try:
-        while done < stop and not watch.exhausted:
-            index = batch_indices(len(frames), config.batch, config.seed, done)
-            state, metrics = run.step(state, take(frames, index), jax.random.fold_in(key, done))
-            done += 1
-            skipped = max(
-                int(state.generator_opt.notfinite_count),
-                int(state.discriminator_opt.notfinite_count),
+class _Run:
+    """The run of a folder: its state, checkpoints and logs.
+
+    Args:
+        folder: Folder of the run.
+        problem: What is learned.
+        first: The state before the first step.
+        data: Frames.
+        total: Steps of the whole run.
+    """
+
+    def __init__(
+        self,
+        folder: pathlib.Path,
+        problem: Problem,
+        first: TrainState,
+        data: _Data,
+        total: int,
+    ) -> None:
+        self._problem, self._first, self._data, self._total = problem, first, data, total
+        self._config, self._folder = problem.config, folder
+        self._checkpoints = Checkpoints(folder / "checkpoints")
+        self._best = Checkpoints(folder / "best", keep=1)
+        restored = self._checkpoints.latest(first)
+        self._state = first if restored is None else restored
+        self._saved = -1 if restored is None else int(restored.step)
+        self._done = int(self._state.step)
+        self._best.forget_after(self._done)
+        logged = read_metrics(folder)
+        self._stopping = EarlyStopping(logged, self._done, self._config.patience)
+        self._gan = GanMonitor(logged, self._done)
+        self._board = TensorBoardLogger(folder)
+
+    def train(self, stop: int, report: _Report | None) -> None:
+        """Steps until ``stop``, or until validation stops improving."""
+        config, began = self._config, time.perf_counter()
+        key = jax.random.key(config.seed)
+
+        def log(values: dict[str, float]) -> None:
+            values |= {"step": self._done, "seconds": round(time.perf_counter() - began, 3)}
+            append_line(self._folder / METRICS, values)
+            self._board.write(values, self._done)
+            if report is not None:
+                report(self._done, stop, values)
+
+        frames = self._data.frames
+        while self._done < stop and not self._stopping.exhausted:
+            index = batch_indices(len(frames), config.batch, config.seed, self._done)
+            step_key = jax.random.fold_in(key, self._done)
+            self._state, metrics = train_step(
+                self._problem, self._state, take(frames, index), step_key
             )
-            if skipped >= config.max_skipped:
-                raise PhysXNetError(
-                    f"step {done}: {skipped} updates in a row were not finite. Lower the"
-                    " learning rate or look for NaN in the data."
-                )
-            last = done == stop
-            if done % 20 == 0 or last:
+            self._done += 1
+            self._check_finite()
+            if self._done % 20 == 0 or self._done == stop:
                 values = {k: float(v) for k, v in metrics.items()}
-                note(values | players.update(values))
-            # On schedule alone: a run that is stopped on the way has to be the same run.
-            if unseen is not None and (done % config.validate_every == 0 or done == total):
-                losses, shown = _validate(config, run, state, unseen)
-                if watch.update(losses["validation_mm"]):
-                    best_kept.save(state, {"step": done, **losses})
-                note(losses)
-                board.show(shown, done)
-            if done % config.checkpoint_every == 0:
-                checkpoints.save(state, {"step": done})
-    finally:
-        board.close()
-        if restored is None or int(restored.step) != int(state.step):
-            checkpoints.save(state, {"step": int(state.step)})
-        checkpoints.close()
-    best = best_kept.latest(run.first) if unseen is not None else None
-    best_kept.close()
-    chosen = state if best is None else best
-    return make_predictor(config.model, atlas, surface, normalisation, chosen, run.graph)
+                log(values | self._gan.update(values))
+            # Only on schedule, so that an interrupted run stays identical.
+            if self._done % config.validate_every == 0 or self._done == self._total:
+                self._validate(log)
+            if self._done % config.checkpoint_every == 0:
+                self._checkpoints.save(self._state, {"step": self._done})
+
+    def _check_finite(self) -> None:
+        states = (self._state.generator_opt, self._state.discriminator_opt)
+        skipped = max(int(s.notfinite_count) for s in states)
+        if skipped >= self._config.max_skipped:
+            raise PhysXNetError(
+                f"step {self._done}: {skipped} updates in a row were not finite. Lower the"
+                " learning rate or look for NaN in the data."
+            )
+
+    def _validate(self, log: Callable[[dict[str, float]], None]) -> None:
+        if self._data.unseen is None:
+            return
+        losses, shown = _validate(self._problem, self._state, self._data.unseen)
+        if self._stopping.update(losses["validation_mm"]):
+            self._best.save(self._state, {"step": self._done, **losses})
+        log(losses)
+        self._board.show(shown, self._done)
+
+    def best(self) -> TrainState:
+        """The state that did best in validation; the last one without validation."""
+        best = self._best.latest(self._first) if self._data.unseen is not None else None
+        self._best.close()
+        return self._state if best is None else best
+
+    def close(self) -> None:
+        """Saves what isn't saved yet."""
+        self._board.close()
+        if self._saved != int(self._state.step):
+            self._checkpoints.save(self._state, {"step": int(self._state.step)})
+        self._checkpoints.close()
 
 
 def _held_out(config: TrainConfig, sequences: Items[Sequence]) -> list[Sequence]:
@@ -174,36 +274,37 @@ def _held_out(config: TrainConfig, sequences: Items[Sequence]) -> list[Sequence]
 
 
 def _validate(
-    config: TrainConfig, run: Steps, state: TrainState, frames: Frames
+    problem: Problem, state: TrainState, frames: Frames
 ) -> tuple[dict[str, float], dict[str, tuple[np.ndarray, np.ndarray]]]:
-    """Mean absolute errors [mm] on what isn't trained on, and maps of the middle."""
+    """Mean absolute errors [mm] on held-out frames, and maps of a frame in the middle."""
+    config = problem.config
     sums = dict.fromkeys(config.model.templates, 0.0)
     weights = dict.fromkeys(config.model.templates, 0.0)
     shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    # Neighbouring frames tell the same.
+    # Neighbouring frames are nearly identical.
     order = np.arange(0, len(frames), 3)
     for start in range(0, len(order), config.batch):
         real = order[start : start + config.batch]
         batch = take(frames, np.resize(real, config.batch))
         for t in config.model.templates:
-            # What fills up the last batch counts for nothing.
+            # Padding of the last batch has zero weight.
             batch[f"weight_{t}"][len(real) :] = 0.0
-        losses, maps = run.look(state, batch)
+        losses, maps = eval_step(problem, state, batch)
         for t, value in losses.items():
             count = float(batch[f"weight_{t}"].sum())
             sums[t] += count * float(value)
             weights[t] += count
         if start <= len(order) // 2 < start + config.batch:
             shown = {t: (np.asarray(a[0]), np.asarray(b[0])) for t, (a, b) in maps.items()}
-    # What of it came off the body tells nothing.
+    # Templates without usable cloth are left out.
     each = {f"validation_mm_{t}": sums[t] / weights[t] for t in sums if weights[t]}
     return {"validation_mm": float(np.mean(list(each.values()))), **each}, shown
 
 
-def _same_run(path: pathlib.Path, text: str) -> None:
-    """Notes what a run is, or refuses to go on with another one in its folder."""
+def _check_same_run(path: pathlib.Path, text: str) -> None:
+    """Stores the settings of a run, or raises if its folder holds another run."""
     if path.is_file():
-        # What a run begun by an earlier version doesn't say was as it is by default.
+        # Settings that an earlier version didn't store have their defaults.
         before = _filled(json.loads(path.read_text()), json.loads(config_json(TrainConfig(), "")))
         now = json.loads(text)
         changed = [k for k in now if before.get(k) != now[k]]
@@ -213,33 +314,38 @@ def _same_run(path: pathlib.Path, text: str) -> None:
                 " another folder or delete it."
             )
         return
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         part.write_text(text)
 
 
-def _filled(told: dict[str, Any], usual: dict[str, Any]) -> dict[str, Any]:
-    """Settings, with what isn't among them as it is by default."""
-    inner = {k: _filled(told.get(k, {}), v) for k, v in usual.items() if isinstance(v, dict)}
-    return {**usual, **told, **inner}
+def _filled(given: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
+    """Settings completed with defaults."""
+    inner = {k: _filled(given.get(k, {}), v) for k, v in defaults.items() if isinstance(v, dict)}
+    return {**defaults, **given, **inner}
 
 
-def make_predictor(
-    model: ModelConfig,
-    atlas: Atlas,
-    surface: Surface,
-    normalisation: Normalisation,
-    state: TrainState,
-    graph: nnx.GraphDef,
-) -> Predictor:
-    """The predictor of a training state."""
-    network = nnx.merge(graph, state.generator, state.generator_rest, copy=True)
+def make_predictor(problem: Problem, state: TrainState) -> Predictor:
+    """The predictor of a training state.
+
+    Args:
+        problem: From `make_problem`.
+        state: The state to take parameters from.
+    """
+    network = nnx.merge(problem.generator, state.generator, state.generator_rest, copy=True)
     network.eval()
     graph, values = nnx.split(network)
-    return Predictor(atlas, surface, normalisation, values, graph, model)
+    return Predictor(
+        problem.atlas,
+        problem.texel_points,
+        problem.normalisation,
+        values,
+        graph,
+        problem.config.model,
+    )
 
 
 def _normalisation(
-    config: TrainConfig, frames: Frames, surface: Surface, tables: dict[str, ClothTables]
+    config: TrainConfig, frames: Frames, texel_points: TexelPoints, tables: dict[str, ClothTables]
 ) -> Normalisation:
     rng = np.random.default_rng(config.seed)
     offsets = {}
@@ -261,5 +367,5 @@ def _normalisation(
             jnp.asarray(frames.translations[pick, -1]),
             config.model.family,
         )
-        offsets[t] = meters[:, np.asarray(surface.valid[t])]
-    return measure_normalisation(frames, surface, offsets, seed=config.seed)
+        offsets[t] = meters[:, np.asarray(texel_points.valid[t])]
+    return measure_normalisation(frames, texel_points, offsets, seed=config.seed)

@@ -14,14 +14,14 @@ def soft_labels(
     """Noisy labels: generated in U(0, 0.3), real in U(0.7, 1), a few swapped.
 
     Args:
-        key: Randomness.
-        shape: One label for each patch.
-        real: Which kind.
-        flip: Share of labels that take the other kind's value.
+        key: Random key.
+        shape: One label per patch.
+        real: Whether the maps are real.
+        flip: Share of labels that get a value of the other class.
 
     Note (differs from the paper):
-        Labels of patches are swapped, others in every step; the paper swaps as many of
-        the frames, for an epoch.
+        Labels are swapped for single patches and anew in every step; the paper swaps the
+        same share of frames for an epoch.
 
     References:
         PhysXNet, section 5.1.
@@ -45,7 +45,7 @@ def discriminator_loss(
 
 
 def adversarial_loss(fake_logits: Float[Array, "*batch"]) -> Float[Array, ""]:
-    """The generator's share: its maps should pass for real (PhysXNet, equation 2).
+    """The generator's adversarial loss: its maps should pass as real (PhysXNet, equation 2).
 
     Note (differs from the paper):
         Equation 2 prints 1 - log D; the constant has no gradient and is left out.
@@ -80,7 +80,7 @@ def masked_l2(
     valid: Bool[Array, " texels"],
     sample_weight: Float[Array, " batch"],
 ) -> Float[Array, ""]:
-    """Mean squared error, of the same as `masked_l1`."""
+    """Mean squared error over the same values as `masked_l1`."""
     return _masked_mean(jnp.square(predicted - target), valid, sample_weight)
 
 
@@ -88,29 +88,29 @@ def pooled_l1(
     predicted: Float[Array, "batch height width 3"],
     target: Float[Array, "batch height width 3"],
     mask: Float[Array, "batch height width 1"],
-    scales: int,
+    pyramid_levels: int,
 ) -> Float[Array, ""]:
-    """Mean absolute error of maps at several sizes: each halves the one before.
+    """Mean absolute error of maps at several resolutions, each half the previous one.
 
-    An error that changes its sign from texel to texel counts at the first size alone.
+    An error that changes its sign from texel to texel counts at full resolution only.
 
     Args:
         predicted: Normalised offset maps.
         target: Normalised offset maps.
         mask: 1 for texels that count.
-        scales: How many sizes.
+        pyramid_levels: Number of resolutions.
 
     Returns:
-        The mean over sizes, each over the texels that count; zero if nothing counts.
+        The mean over resolutions, each over the texels that count; zero if nothing counts.
     """
     error, total = (predicted - target) * mask, jnp.zeros(())
     weight = jnp.maximum(jnp.sum(mask), 1.0)
-    for k in range(scales):
+    for k in range(pyramid_levels):
         if k:
             n, height, width, _ = error.shape
             error = jnp.sum(error.reshape(n, height // 2, 2, width // 2, 2, 3), axis=(2, 4))
         total = total + jnp.sum(jnp.abs(error)) / (3.0 * weight)
-    return total / scales
+    return total / pyramid_levels
 
 
 def vertex_loss(
@@ -123,16 +123,16 @@ def vertex_loss(
 ) -> Float[Array, ""]:
     """Error of offsets at vertices and of their differences along edges.
 
-    An error that is the same at all vertices changes no edge: differences tell of strain
-    and folds alone.
+    An error that is the same at all vertices changes no edge: differences measure only
+    strain and folds.
 
     Args:
         predicted: Normalised offsets.
         target: Normalised offsets.
-        edges: The vertices of each edge.
+        edges: Vertex indices of each edge.
         sample_weight: 1 for samples that count, 0 for those without this garment.
         distance: `masked_l1` or `masked_l2`.
-        edge_share: Share of the differences, 0 to 1.
+        edge_share: Share of the differences in the loss, 0 to 1.
     """
     everywhere = jnp.ones((target.shape[1],), bool)
     value = distance(predicted, target, everywhere, sample_weight)

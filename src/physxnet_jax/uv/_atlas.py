@@ -1,4 +1,4 @@
-"""The atlas: the body's uv chart without face, hands and feet, filling the square."""
+"""The atlas: the body's uv chart without face, hands and feet, stretched to the square."""
 
 import dataclasses
 import functools
@@ -15,7 +15,7 @@ from ..typing import pytree
 from ._rasterise import rasterise
 from ._transference import Transference
 
-_LEFT_OUT = (
+_EXCLUDED_JOINTS = (
     ("Head", "Neck1"),
     ("LeftHand", "LThumb", "LeftFingerBase", "LeftHandFinger1"),
     ("RightHand", "RThumb", "RightFingerBase", "RightHandFinger1"),
@@ -39,7 +39,7 @@ class Atlas:
         uv_faces: Their corners in ``uv``, shape [faces, 3].
         height: Rows of a map.
         width: Columns of a map.
-        used_before: Share of texels the whole chart's clothed part covers as it is.
+        used_before: Share of texels that the clothed part covers in the original chart.
     """
 
     texels: Int[Array, " texels"]
@@ -84,7 +84,7 @@ class Atlas:
         return maps.reshape(*batch, height * width, channels)[..., self.texels, :]
 
     def digest(self) -> str:
-        """A hash of what the texels mean; weights are tied to it."""
+        """A hash of the texels and their body points; network weights are tied to it."""
         h = hashlib.sha256(f"{self.height}x{self.width}".encode())
         h.update(np.asarray(self.texels).tobytes())
         h.update(np.asarray(self.to_body.vertices).tobytes())
@@ -94,17 +94,17 @@ class Atlas:
 
 
 def make_atlas(resolution: int | tuple[int, int] = 256, body: Body | None = None) -> Atlas:
-    """The atlas of a size.
+    """Builds the atlas at a resolution.
 
-    The torso and limbs chart is cropped to its bounding box and stretched row by row
-    towards the square's sides, by its smoothed outline.
+    The chart of the torso and limbs is cropped to its bounding box. Its rows are then
+    stretched towards the sides of the square, according to its smoothed outline.
 
     Args:
-        resolution: Texels a side, or (height, width).
+        resolution: Texels per side, or (height, width).
         body: The body; the built-in one by default.
 
     Returns:
-        The atlas. ``used_before`` and ``used`` tell what the stretching gained.
+        The atlas. ``used_before`` and ``used`` give the coverage before and after stretching.
 
     References:
         PhysXNet, section 4.2: face, hands and feet are removed, limbs stretched.
@@ -117,7 +117,7 @@ def make_atlas(resolution: int | tuple[int, int] = 256, body: Body | None = None
 
 @functools.cache
 def _cached_atlas(height: int, width: int) -> Atlas:
-    # What is kept mustn't belong to the program that happens to be traced.
+    # Cached arrays mustn't be tracers of an enclosing transformation.
     with jax.ensure_compile_time_eval():
         return _make_atlas((height, width), load_body())
 
@@ -128,11 +128,11 @@ def _make_atlas(size: tuple[int, int], body: Body) -> Atlas:
     faces, uv_faces = np.asarray(mesh.faces), np.asarray(mesh.uv_faces)
     uv = np.asarray(mesh.uv, dtype=np.float64)
     weights = np.asarray(body.weights)[:NUM_BODY_VERTICES]
-    left_out = np.stack(
-        [weights[:, [body.joint(n) for n in names]].sum(axis=1) for names in _LEFT_OUT]
+    excluded_weight = np.stack(
+        [weights[:, [body.joint(n) for n in names]].sum(axis=1) for names in _EXCLUDED_JOINTS]
     ).max(axis=0)
-    keep = left_out[faces].mean(axis=1) <= 0.5
-    # One chart holds the torso and limbs; crumbs of others are dropped.
+    keep = excluded_weight[faces].mean(axis=1) <= 0.5
+    # One chart holds the torso and limbs; fragments of others are dropped.
     chart = connected_components(uv_faces, len(uv))[uv_faces[:, 0]]
     keep &= chart == np.bincount(chart[keep]).argmax()
     faces, uv_faces = faces[keep], uv_faces[keep]
@@ -143,6 +143,7 @@ def _make_atlas(size: tuple[int, int], body: Body) -> Atlas:
         jnp.asarray(faces[own].astype(np.int32)),
         jnp.asarray(bary.astype(np.float32)),
         jnp.ones((len(own),), bool),
+        NUM_BODY_VERTICES,
     )
     return Atlas(
         jnp.asarray(texels),
@@ -159,7 +160,7 @@ def _make_atlas(size: tuple[int, int], body: Body) -> Atlas:
 def _stretch(
     uv: Float[np.ndarray, "uvs 2"], uv_faces: Int[np.ndarray, "faces 3"]
 ) -> Float[np.ndarray, "uvs 2"]:
-    """The chart cropped, then each row widened to the outline's smoothed reach."""
+    """Crops the chart, then stretches each row so that the smoothed outline reaches the sides."""
     used = np.unique(uv_faces)
     low, high = uv[used].min(axis=0), uv[used].max(axis=0)
     out = (uv - low) / (high - low)

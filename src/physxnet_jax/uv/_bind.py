@@ -7,38 +7,38 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
-from ..body import NUM_BODY_VERTICES, Body
-from ..garment import Garment, Template
+from ..body import NUM_BODY_VERTICES, Body, load_body
+from ..garment import Garment, Template, template
 from ..geometry import TriMesh, cast_rays, closest_points, padded_rows, vertex_normals
 from ..typing import pytree
-from ._atlas import Atlas
+from ._atlas import Atlas, make_atlas
 from ._dress_body import dress_body
 from ._transference import Transference
 
-# Cloth farther from the skin than this isn't what a texel's ray was meant to meet [m].
-_REACH: dict[Template, float] = {"top": 0.08, "bottom": 0.08, "dress": 0.30}
-# A ray hit this much farther than the closest point has met another limb.
-_STRAY = 2.0
+# Maximum distance between skin and cloth along a ray [m].
+_MAX_DISTANCE: dict[Template, float] = {"top": 0.08, "bottom": 0.08, "dress": 0.30}
+# A ray hit more than this many times as far as the closest point lies on another limb.
+_MAX_DISTANCE_RATIO = 2.0
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class Binding:
-    """A garment tied to an atlas.
+    """A garment bound to an atlas.
 
     Attributes:
         to_body: T_XB, body vertices to garment vertices.
         texel: Texels (rows of the atlas) each vertex samples, shape [vertices, 4].
         weight: Their weights, rows sum to 1, shape [vertices, 4].
-        hit_rate: Share of vertices whose ray met the body where it is nearest, no other limb.
-        fallbacks: Vertices bound by the closest point instead.
-        off_chart: Vertices whose texels were all uncovered, bound to the nearest one.
+        hit_rate: Share of vertices whose ray hit the nearest part of the body.
+        fallbacks: Number of vertices bound by the closest point instead.
+        off_chart: Number of vertices without covered texels, bound to the nearest one.
     """
 
     to_body: Transference
     texel: Int[Array, "vertices 4"]
     weight: Float[Array, "vertices 4"]
-    # No part of a program's identity: garments of other sizes share it.
+    # Leaves rather than static fields, so that other values need no new compilation.
     hit_rate: Float[Array, ""]
     fallbacks: Int[Array, ""]
     off_chart: Int[Array, ""]
@@ -46,7 +46,7 @@ class Binding:
     def sample(
         self, values: Float[Array, "*batch texels channels"]
     ) -> Float[Array, "*batch vertices channels"]:
-        """Texel values carried to garment vertices, bilinearly, within the chart."""
+        """Interpolates texel values at garment vertices, bilinearly within the chart."""
         out = jnp.zeros((), values.dtype)
         for k in range(4):
             w = self.weight[:, k]
@@ -55,11 +55,9 @@ class Binding:
         return out
 
 
-def chart_mesh(
-    atlas: Atlas, body: Body, rest: Float[Array, "all 3"], template: Template
-) -> TriMesh:
+def chart_mesh(atlas: Atlas, body: Body, rest: Float[Array, "all 3"], kind: Template) -> TriMesh:
     """The clothed part of the body at rest; with joined legs for a dress."""
-    vertices = dress_body(body, np.asarray(rest)) if template == "dress" else rest
+    vertices = dress_body(body, np.asarray(rest)) if kind == "dress" else rest
     full = jnp.asarray(np.asarray(vertices, dtype=np.float32))
     return TriMesh(full[:NUM_BODY_VERTICES], atlas.faces, atlas.uv, atlas.uv_faces)
 
@@ -67,7 +65,7 @@ def chart_mesh(
 def garment_map_rows(
     atlas: Atlas, body: Body, rest: Float[Array, "all 3"], garment: Garment
 ) -> Transference:
-    """T_BC: for each texel, the cloth point that the ray along its normal meets.
+    """T_BC: for each texel, the cloth point that the ray along its normal hits.
 
     Args:
         atlas: The atlas.
@@ -76,11 +74,11 @@ def garment_map_rows(
         garment: The garment on it.
 
     Returns:
-        Garment vertices to texels; ``valid`` where the ray met cloth within reach.
+        Garment vertices to texels; ``valid`` where the ray hit cloth within reach.
 
     Note (differs from the paper):
-        Cast in the rest pose (arms 45 degrees down), in which garments are modelled,
-        not in a T-pose.
+        Rays are cast in the rest pose (arms 45 degrees down), in which garments are
+        modelled, not in a T-pose.
 
     References:
         PhysXNet, equation 8.
@@ -89,55 +87,62 @@ def garment_map_rows(
     closed = mesh.replace(faces=_all_faces(body))
     normals = atlas.to_body @ vertex_normals(closed.vertices, closed.faces)
     points = atlas.to_body @ mesh.vertices
-    # From just below the skin, so that cloth lying on it is met too.
+    # Rays start just below the skin, so that they also hit cloth lying on it.
     start = 0.005
     hits = cast_rays(
         garment.mesh,
         points - start * normals,
         normals,
-        max_distance=_REACH[garment.template] + start,
+        max_distance=_MAX_DISTANCE[garment.template] + start,
     )
-    return Transference(garment.mesh.faces[hits.face], hits.weights, hits.valid)
+    faces = garment.mesh.faces[hits.face]
+    return Transference(faces, hits.weights, hits.valid, garment.num_vertices)
 
 
 def bind(
-    atlas: Atlas,
-    body: Body,
-    rest: Float[Array, "all 3"],
     garment: Garment,
-    valid: Bool[Array, " texels"],
+    *,
+    atlas: Atlas | None = None,
+    body: Body | None = None,
+    rest: Float[Array, "all 3"] | None = None,
+    valid: Bool[Array, " texels"] | None = None,
 ) -> Binding:
-    """Ties a garment to the texels of its template, once.
+    """Binds a garment to the texels of its template, once.
 
-    Each vertex casts a ray along its normal, both ways, and takes the nearest hit;
-    where none is met, or one that lies on another limb, the closest point. The texel
-    found there is sampled bilinearly among texels of its own neighbourhood that the
-    template covers, so nothing bleeds over the chart's edge.
+    Each vertex casts a ray along its normal, in both directions, and takes the nearest
+    hit. Without a hit, or with one on another limb, it takes the closest point. Sampling
+    there is bilinear among texels that the template covers and that are neighbours on
+    the body, so nothing bleeds over the chart's edge.
 
     Args:
-        atlas: The atlas.
-        body: The body.
-        rest: Its rest vertices [m].
-        garment: Any garment on it.
-        valid: Texels that the template covers.
+        garment: Any garment on the body.
+        atlas: The atlas; `make_atlas` of the body by default.
+        body: The body; the built-in one by default.
+        rest: Its rest vertices [m]; the default shape by default.
+        valid: Texels that the template covers; found by rays to the template by default.
 
     Returns:
-        The binding, with counts of what had to fall back.
+        The binding, with counts of its fallbacks.
 
     References:
         PhysXNet, equation 9: T_XB.
     """
+    body = load_body() if body is None else body
+    rest = body.rest_vertices(body.default_shape()) if rest is None else rest
+    atlas = make_atlas(body=body) if atlas is None else atlas
+    if valid is None:
+        valid = garment_map_rows(atlas, body, rest, template(garment.template)).valid
     mesh = chart_mesh(atlas, body, rest, garment.template)
     normals = vertex_normals(garment.mesh.vertices, garment.mesh.faces)
     count = len(normals)
     points, normals = (
         jnp.asarray(padded_rows(np.asarray(x))) for x in (garment.mesh.vertices, normals)
     )
-    hits = cast_rays(mesh, points, normals, both=True, max_distance=_REACH[garment.template])
+    hits = cast_rays(mesh, points, normals, both=True, max_distance=_MAX_DISTANCE[garment.template])
     near = closest_points(mesh, points)
-    # On the host from here: nothing to compile.
+    # NumPy on the host from here, so that nothing has to be compiled.
     reach = np.where(np.asarray(hits.valid), np.abs(np.asarray(hits.distance)), np.inf)
-    good = reach <= _STRAY * np.sqrt(np.asarray(near.squared_distance)) + 0.01
+    good = reach <= _MAX_DISTANCE_RATIO * np.sqrt(np.asarray(near.squared_distance)) + 0.01
     face = np.where(good, np.asarray(hits.face), np.asarray(near.face))
     weights = np.where(good[:, None], np.asarray(hits.weights), np.asarray(near.weights))
     good, face, weights = good[:count], face[:count], weights[:count]
@@ -148,6 +153,7 @@ def bind(
             jnp.asarray(np.asarray(mesh.faces)[face]),
             jnp.asarray(weights),
             jnp.asarray(np.ones(face.shape, bool)),
+            NUM_BODY_VERTICES,
         ),
         jnp.asarray(texel),
         jnp.asarray(weight),
@@ -167,12 +173,13 @@ def sampling_weights(
 ) -> tuple[Int[np.ndarray, "points 4"], Float[np.ndarray, "points 4"], int]:
     """Bilinear weights over valid texels that are neighbours on the body as well.
 
-    Texels next to each other on the map may lie on different limbs: those farther than
-    a few texels' width from the point, measured on the body, don't count. A point
-    without any takes the texel nearest to it on the body.
+    Adjacent texels of the map may lie on different limbs. Texels more than a few texel
+    widths from the point, measured on the body, are ignored. A point without remaining
+    texels takes the texel nearest to it on the body.
 
     Returns:
-        Rows of the atlas, weights that sum to 1, and how many points had none.
+        Rows of the atlas, weights that sum to 1, and the number of points that took the
+        nearest texel.
     """
     row_of = np.full(atlas.height * atlas.width, -1)
     row_of[np.asarray(atlas.texels)] = np.arange(atlas.num_texels)
@@ -180,8 +187,10 @@ def sampling_weights(
     y = (1.0 - uv[:, 1]) * atlas.height - 0.5
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
     fx, fy = x - x0, y - y0
-    places = np.asarray(atlas.to_body @ mesh.vertices)
-    here = np.einsum("vk,vkc->vc", weights, np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]])
+    texel_points = np.asarray(atlas.to_body @ mesh.vertices)
+    query_points = np.einsum(
+        "vk,vkc->vc", weights, np.asarray(mesh.vertices)[np.asarray(mesh.faces)[face]]
+    )
     texel = np.zeros((len(uv), 4), dtype=np.int32)
     weight = np.zeros((len(uv), 4))
     # One texel covers about 1.5 m / size of skin; seams are much farther apart.
@@ -197,20 +206,20 @@ def sampling_weights(
             -1,
         )
         ok = (row >= 0) & valid[row]
-        ok &= np.linalg.norm(places[row] - here, axis=1) < limit
+        ok &= np.linalg.norm(texel_points[row] - query_points, axis=1) < limit
         w = np.where(dx, fx, 1 - fx) * np.where(dy, fy, 1 - fy)
         texel[:, k] = np.where(ok, row, 0)
         weight[:, k] = np.where(ok, w, 0.0)
     total = weight.sum(axis=1)
-    lost = total < 1e-3
-    if lost.any():
+    unmatched = total < 1e-3
+    if unmatched.any():
         rows = np.flatnonzero(valid)
-        nearest = rows[KDTree(places[rows]).query(here[lost])[1]]
-        texel[lost] = nearest[:, None]
-        weight[lost] = [1.0, 0.0, 0.0, 0.0]
-        total = np.where(lost, 1.0, total)
+        nearest = rows[KDTree(texel_points[rows]).query(query_points[unmatched])[1]]
+        texel[unmatched] = nearest[:, None]
+        weight[unmatched] = [1.0, 0.0, 0.0, 0.0]
+        total = np.where(unmatched, 1.0, total)
     weight /= total[:, None]
-    return texel, weight.astype(np.float32), int(lost.sum())
+    return texel, weight.astype(np.float32), int(unmatched.sum())
 
 
 def _all_faces(body: Body) -> Array:

@@ -12,10 +12,10 @@ _BLEND = 0.08
 
 
 def dress_body(body: Body, rest: Float[np.ndarray, "all 3"]) -> Float[np.ndarray, "vertices 3"]:
-    """Body vertices at rest with the legs blown up to one elliptic column.
+    """Body vertices at rest with the legs expanded to one elliptic column.
 
     At each height the outer half of each leg becomes half of the ellipse that encloses
-    both legs, so that normals meet a skirt all round; the inner half folds beneath it.
+    both legs, so that normals hit a skirt all around. The inner half folds beneath it.
 
     Args:
         body: The body.
@@ -56,7 +56,7 @@ def dress_body(body: Body, rest: Float[np.ndarray, "all 3"]) -> Float[np.ndarray
         axis = [
             np.interp(y, [foot[1], knee[1], hip[1]], [foot[k], knee[k], hip[k]]) for k in (0, 2)
         ]
-        # Around the leg: 0 outwards, 90 degrees in front. The outer half of the ring
+        # Angle around the leg: 0 outwards, 90 degrees in front. The outer half of the ring
         # becomes half the ellipse; the inner half folds back beneath it.
         angle = np.arctan2(z - axis[1], sign * (x - axis[0]))
         inner = np.clip((np.abs(angle) - np.pi / 2) / (np.pi / 2), 0.0, 1.0)

@@ -18,14 +18,14 @@ def velocity_maps(
 ) -> Float[Array, "frames texels 3"]:
     """I_v[k] = I_B[k] - I_B[k-1], in m/s (PhysXNet, equation 6).
 
-    The first frame is repeated before itself, so its velocity is zero.
+    The first frame is also used as its own predecessor, so its velocity is zero.
 
     Args:
-        points: Surface points of successive frames [m].
-        fps: Frames a second.
+        points: Texel positions of successive frames [m].
+        fps: Frames per second.
 
     Note (differs from the paper):
-        Scaled by the frame rate, so that the network sees the same physics at any.
+        Scaled by the frame rate, so that the network's inputs don't depend on it.
     """
     before = jnp.concatenate([points[:1], points[:-1]])
     return (points - before) * fps
@@ -37,22 +37,22 @@ def acceleration_maps(
     """I_a[k] = I_v[k] - I_v[k-1], in m/s^2 (PhysXNet, equation 7).
 
     Args:
-        points: Texels' positions [m], not their velocities: these are computed here.
-        fps: Frames a second.
+        points: Texel positions [m], not velocities: these are computed here.
+        fps: Frames per second.
     """
     velocity = velocity_maps(points, fps)
     before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
     return (velocity - before) * fps
 
 
-def garment_map(
+def cloth_offsets(
     to_cloth: Transference,
     cloth: Float[Array, "*batch vertices 3"],
     points: Float[Array, "*batch texels 3"],
 ) -> Float[Array, "*batch texels 3"]:
     """I_C = T_BC M_C - I_B: offsets from skin to cloth [m] (PhysXNet, equation 8).
 
-    Texels whose ray met no cloth are zero; see ``to_cloth.valid``.
+    Texels whose ray hit no cloth are zero; see ``to_cloth.valid``.
     """
     offset = to_cloth @ cloth - points
     valid = to_cloth.valid.reshape((1,) * (offset.ndim - 2) + (-1, 1))

@@ -19,7 +19,7 @@ def rasterise(
     """Texels whose centre lies in a triangle of the uv chart.
 
     Edge functions are evaluated from the lower to the higher vertex index, so both
-    faces beside an edge see the same value: no texel between them is lost. A texel
+    faces beside an edge use the same value and no texel between them is lost. A texel
     that several faces cover (a centre on an edge, an overlap) goes to the first one.
     Triangles without area cover nothing.
 
@@ -55,9 +55,9 @@ def rasterise(
     )
     owner = np.asarray(owner)
     texels = np.flatnonzero(owner < len(faces)).astype(np.int32)
-    own = owner[texels].astype(np.int32)
+    face_of_texel = owner[texels].astype(np.int32)
     points = np.column_stack([texels % width, texels // width]).astype(np.float64)
-    a, b, c = (xy[faces[own, k]].astype(np.float64) for k in range(3))
+    a, b, c = (xy[faces[face_of_texel, k]].astype(np.float64) for k in range(3))
     area = _cross(b - a, c - a)
     weights = np.column_stack(
         [
@@ -67,7 +67,7 @@ def rasterise(
         ]
     )
     weights = np.clip(weights / area[:, None], 0.0, 1.0)
-    return texels, own, weights / weights.sum(axis=1, keepdims=True)
+    return texels, face_of_texel, weights / weights.sum(axis=1, keepdims=True)
 
 
 def _cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -83,9 +83,9 @@ def _owners(
     height: int,
     width: int,
     size: int,
-    nobody: int,
+    no_face: int,
 ) -> Array:
-    """First covering face of every texel, ``nobody`` where there is none."""
+    """First covering face of every texel; the number of faces where there is none."""
     offsets = jnp.stack(
         jnp.meshgrid(jnp.arange(size), jnp.arange(size), indexing="xy"), axis=-1
     ).reshape(-1, 2)
@@ -109,6 +109,6 @@ def _owners(
         flat = jnp.where(inside, y * width + x, height * width)
         return owner.at[flat].min(jnp.broadcast_to(ids[:, None], flat.shape), mode="drop"), None
 
-    start = jnp.full((height * width,), nobody, jnp.int32)
+    start = jnp.full((height * width,), no_face, jnp.int32)
     owner, _ = jax.lax.scan(block, start, (faces, low, index))
     return owner

@@ -4,9 +4,9 @@ import pathlib
 from collections.abc import Mapping, Sequence
 
 from ..errors import MissingDependencyError
-from ..files import whole_file
+from ..files import atomic_write
 
-# Of methods beyond the tenth: colours come again.
+# Markers distinguish methods beyond the tenth, whose colours repeat.
 _MARKS = "osD^"
 _LINES = ("--", "-.")
 
@@ -17,14 +17,14 @@ def draw_work_precision(
     floors: Mapping[str, float],
     times: Mapping[str, Mapping[str, float]] | None = None,
 ) -> pathlib.Path:
-    """Error against time, a panel for each scene, both axes logarithmic.
+    """Draws error against time, a panel for each scene, both axes logarithmic.
 
     Args:
         path: A PNG file.
-        points: Scene, method, error [mm] and time [ms a frame]; those of a method are
-            joined in the order given.
+        points: Scene, method, error [mm] and time [ms per frame]; a method's points are
+            joined in the given order.
         floors: Noise floor of a scene [mm]; a point below it is drawn hollow.
-        times: By scene, methods of which only the time is known [ms a frame].
+        times: By scene, times of methods without a known error [ms per frame].
 
     Raises:
         MissingDependencyError: matplotlib isn't installed.
@@ -70,7 +70,7 @@ def draw_work_precision(
     legend = {name: handle for handles, names in drawn for handle, name in zip(handles, names)}
     figure.legend(legend.values(), legend.keys(), loc="outside lower center", ncols=4, fontsize=7)
     path = pathlib.Path(path)
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         figure.savefig(part, dpi=120, format="png")
     return path
 
@@ -78,12 +78,12 @@ def draw_work_precision(
 def draw_bars(
     path: str | pathlib.Path, bars: Sequence[tuple[str, str, str, float]], label: str
 ) -> pathlib.Path:
-    """Bars of every method side by side for every action, a panel for each garment.
+    """Draws bars of every method side by side for every action, a panel for each garment.
 
     Args:
         path: A PNG file.
         bars: Panel, action, method and value.
-        label: Of the values' axis.
+        label: Label of the value axis.
 
     Raises:
         MissingDependencyError: matplotlib isn't installed.
@@ -119,6 +119,6 @@ def draw_bars(
         axes.grid(True, axis="y", alpha=0.3)
         axes.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     path = pathlib.Path(path)
-    with whole_file(path) as part:
+    with atomic_write(path) as part:
         figure.savefig(part, dpi=110, format="png")
     return path

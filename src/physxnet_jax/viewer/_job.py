@@ -1,4 +1,4 @@
-"""What the viewer shows, computed from what is chosen in it."""
+"""Computes what the viewer shows from its settings."""
 
 import dataclasses
 import functools
@@ -11,22 +11,23 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from .._environment import free_programs
+from .._environment import clear_caches_if_full
 from ..body import load_body
 from ..dressing import (
+    Inference,
+    Simulation,
     animated_meshes,
     dress,
-    fit_surface,
-    load_ladder,
     make_scene,
-    wanted_clip,
+    run_simulation,
+    with_body,
 )
 from ..errors import PhysXNetError
-from ..garment import FABRICS
-from ..io import DEFAULT, AnimatedMesh, load_predictor, read_card
-from ..models import Predictor
-from ..motion import BLOCK, Motion, clip_transforms, stand_on_floor
-from ..simulation import ACCURACY, Air, Effect, SelfContact, prepare_scene, simulate_batch
+from ..evaluation import load_cost_table, method_name
+from ..garment import FABRICS, with_default_fabric
+from ..io import AnimatedMesh
+from ..models import Predictor, load_predictor, read_card
+from ..motion import BLOCK, Motion, clip_transforms, prepare_motion, stand_on_floor
 from ._live import Live
 from ._maps import frame_maps
 
@@ -35,42 +36,35 @@ Progress = Callable[[str, int, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class Choice:
-    """Everything that can be chosen.
+    """Settings of the viewer.
 
     Attributes:
         motion: A built-in clip or a motion file.
         wear: Templates and garment files.
         method: ``network``, ``lbs`` or ``simulate``.
-        weights: Which network, and the ways behind its name (see `load_predictor`).
-        push_out: Push vertices that end inside the body onto it.
-        compare: Simulate the same clothes beside it, and colour by the distance.
-        live: Ask the network for each frame in the moment it is shown, and tell what that
-            takes.
+        inference: Weights and post-processing.
+        compare: Simulate the same clothes for comparison, and colour by the distance.
+        live: Run the network on each frame when it is shown, and report the time.
         shape: Shape parameters by name; none for the default shape.
-        accuracy: When simulated; the reference is always ``standard``, which taught the
-            networks.
-        fabric: Of all garments when simulated; their own if None.
-        wind: Steady wind when simulated [m/s].
-        self_contact: Garments collide with themselves when simulated.
-        frames: Frames at most.
-        fps: Frames a second.
-        source_fps: True rate of a motion file [1/s], where its header is wrong or silent.
-        skeleton: The ASF of an AMC file, if it doesn't lie beside it.
-        joint_map: File of joint names for a motion file of unknown ones.
+        simulation: Options of the simulator. The reference is always ``standard``, on which
+            the networks were trained.
+        fabric: Fabric of simulated garments that specify none.
+        frames: Maximum number of frames.
+        fps: Frames per second.
+        source_fps: True rate of a motion file [1/s], if its header is wrong or lacks it.
+        skeleton: The ASF file of an AMC file, if it is in another folder.
+        joint_map: File of joint names for a motion file whose names are unknown.
     """
 
     motion: str = "walk"
     wear: tuple[str, ...] = ("top", "bottom")
     method: str = "network"
-    weights: str = DEFAULT
-    push_out: bool = True
+    inference: Inference = dataclasses.field(default_factory=Inference)
     compare: bool = False
     live: bool = False
     shape: tuple[tuple[str, float], ...] = ()
-    accuracy: str = "standard"
+    simulation: Simulation = dataclasses.field(default_factory=Simulation)
     fabric: str | None = None
-    wind: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    self_contact: bool = False
     frames: int = 150
     fps: float = 30.0
     source_fps: float | None = None
@@ -80,19 +74,19 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """A choice carried out.
+    """The result of a choice.
 
     Attributes:
-        choice: What was asked for.
-        garments: The garments in motion.
+        choice: The settings.
+        garments: The animated garments.
         reference: The same garments simulated, or none.
         rest: Rest vertices of the body [m], shape [vertices, 3].
         world: World rotations of its joints, shape [frames, joints, 3, 3].
         shift: World translations of its joints [m], shape [frames, joints, 3].
         distances: By garment, distance to the reference [m], shape [frames, vertices].
-        told: What was done, how fast and how well, as Markdown.
+        summary: The computation, its speed and its accuracy, as Markdown.
         clip: The motion.
-        live: What computes the garments frame by frame; None if that isn't wanted.
+        live: Computes the garments frame by frame; None if it wasn't requested.
     """
 
     choice: Choice
@@ -102,7 +96,7 @@ class Shown:
     world: np.ndarray
     shift: np.ndarray
     distances: dict[str, np.ndarray]
-    told: str
+    summary: str
     clip: Motion
     live: Live | None = None
 
@@ -112,7 +106,7 @@ class Shown:
         return len(self.world)
 
     def meshes(self) -> tuple[AnimatedMesh, ...]:
-        """The body and the garments, to be written."""
+        """The body and the garments, for export."""
         positions = {m.name: m.positions for m in self.garments}
         body = animated_meshes(load_body(), self.clip, _shape(self.choice), (), positions)
         return (*body, *self.garments)
@@ -120,9 +114,8 @@ class Shown:
     def maps(self, frame: int, templates: tuple[str, ...]) -> dict[str, np.ndarray]:
         """The network's maps of a frame, as pictures."""
         choice = self.choice
-        predictor = _predictor(
-            choice.weights, choice.shape, str(read_card(choice.weights)["sha256"])
-        )
+        weights = str(choice.inference.weights)
+        predictor = _predictor(weights, choice.shape, str(read_card(weights)["sha256"]))
         window = predictor.config.inputs.window
         rows = np.maximum(np.arange(frame + 1 - window, frame + 1), 0)
         return frame_maps(
@@ -135,36 +128,36 @@ class Shown:
 
 
 def check_choice(choice: Choice) -> None:
-    """Refuses what no computation could carry out.
+    """Checks that a choice can be computed.
 
     Raises:
-        PhysXNetError: No frame is asked for, or there is no such fabric, shape or network.
+        PhysXNetError: No frame is requested, or there is no such fabric, shape or network.
     """
     if choice.frames < 1:
-        raise PhysXNetError(f"frames is {choice.frames}; ask for at least one.")
+        raise PhysXNetError(f"frames is {choice.frames}; it must be at least one.")
     if choice.fabric is not None and choice.fabric not in FABRICS:
         raise PhysXNetError(f"No fabric '{choice.fabric}'; there are {', '.join(FABRICS)}.")
     _shape(choice)
     if choice.method == "network":
-        read_card(choice.weights)
+        read_card(str(choice.inference.weights))
 
 
-def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
-    """Dresses the person as chosen.
+def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
+    """Dresses the person with these settings.
 
     Args:
-        choice: What is wanted.
-        progress: Called with a stage, frames done and frames in all.
+        choice: The settings.
+        progress: Called with a stage, the frames done and the total.
 
     Raises:
-        PhysXNetError: Anything that can't be read, bound or worn; the text says why.
+        PhysXNetError: An input can't be read, bound or worn; the text gives the reason.
     """
     check_choice(choice)
-    # A page may be open for days.
-    free_programs()
+    # A page may stay open for days.
+    clear_caches_if_full()
     body = load_body()
     shape = _shape(choice)
-    clip = wanted_clip(
+    clip = prepare_motion(
         choice.motion,
         fps=choice.fps,
         frames=choice.frames,
@@ -176,54 +169,31 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
     )
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     if shape is not None:
-        # As `dress` does with what is left of the clip: all stand on one floor.
+        # As in `dress`, after slicing: the lowest foot of the clip is on the floor.
         clip = stand_on_floor(body, clip, rest)
     garments: tuple[AnimatedMesh, ...] = ()
     reference: tuple[AnimatedMesh, ...] = ()
     lines = [f"{clip.num_frames} frames at {clip.fps:g} fps"]
     if choice.wear and choice.method == "simulate":
         garments, ms = _simulated(choice, clip, progress)
-        lines.append(f"simulated ({choice.accuracy}): {ms:.0f} ms a frame, compilation included")
-    elif choice.wear:
-        dressed = dress(
-            clip,
-            choice.wear,
-            method="lbs" if choice.method == "lbs" else "network",
-            weights=choice.weights,
-            fps=choice.fps,
-            shape=shape,
-            include_body=False,
-            push_out=choice.push_out,
-            progress=progress,
+        lines.append(
+            f"simulated ({choice.simulation.accuracy}): {ms:.0f} ms a frame, compilation included"
         )
-        garments = dressed.garments
-        stage = next(s for s in dressed.stages if s.name in ("network", "skinning"))
-        cost = f"first {BLOCK} frames {stage.cold_ms:.0f} ms"
-        if stage.warm_ms is not None:
-            cost = f"{stage.warm_ms:.1f} ms a frame ({cost})"
-        inside = 100 * float(np.mean(list(dressed.inside.values())))
-        lines += [f"{choice.method}: {cost}", f"{inside:.2f} % of vertices inside the body"]
-        lines.append(_known_error(choice))
-        # A note may name a file; the page takes HTML.
-        lines += [html.escape(note) for note in dressed.notes]
-    distances = {}
+    elif choice.wear:
+        garments, found = _dressed(choice, clip, shape, progress)
+        lines += found
+    distances: dict[str, np.ndarray] = {}
     if choice.compare and choice.wear and choice.method != "simulate":
-        taught = dataclasses.replace(choice, accuracy="standard")
-        reference, _ = _simulated(taught, clip, progress)
-        by_name = {m.name: m.positions for m in reference}
-        for m in garments:
-            distances[m.name] = np.linalg.norm(m.positions - by_name[m.name], axis=2)
-            rmse = 1e3 * float(np.sqrt((distances[m.name] ** 2).mean()))
-            # A garment's name comes from a file's; the page takes HTML.
-            name = html.escape(m.name)
-            lines.append(f"{name}: {rmse:.1f} mm RMSE from the simulation beside it")
+        reference, distances = _compared(choice, clip, garments, progress)
+        for name, distance in distances.items():
+            rmse = 1e3 * float(np.sqrt((distance**2).mean()))
+            # Escaped, because the name may come from a file and the page renders HTML.
+            lines.append(f"{html.escape(name)}: {rmse:.1f} mm RMSE from the simulation")
     world, shift = clip_transforms(body, rest, clip)
-    told = "\n".join(f"* {line}" for line in lines if line)
+    summary = "\n".join(f"* {line}" for line in lines if line)
     live = None
     if choice.live and choice.wear and choice.method == "network":
-        live = Live(
-            clip, choice.wear, weights=choice.weights, shape=shape, push_out=choice.push_out
-        )
+        live = Live(clip, choice.wear, inference=choice.inference, shape=shape)
     return Shown(
         choice,
         garments,
@@ -232,29 +202,60 @@ def carry_out(choice: Choice, progress: Progress | None = None) -> Shown:
         np.asarray(world),
         np.asarray(shift),
         distances,
-        told,
+        summary,
         clip,
         live,
     )
 
 
+def _dressed(
+    choice: Choice, clip: Motion, shape: Any | None, progress: Progress | None
+) -> tuple[tuple[AnimatedMesh, ...], list[str]]:
+    """Garments by network or skinning, and lines that describe the result."""
+    dressed = dress(
+        clip,
+        choice.wear,
+        method="lbs" if choice.method == "lbs" else "network",
+        inference=choice.inference,
+        fps=choice.fps,
+        shape=shape,
+        include_body=False,
+        progress=progress,
+    )
+    stage = next(s for s in dressed.stages if s.name in ("network", "skinning"))
+    cost = f"first {BLOCK} frames {stage.cold_ms:.0f} ms"
+    if stage.warm_ms is not None:
+        cost = f"{stage.warm_ms:.1f} ms a frame ({cost})"
+    inside = 100 * float(np.mean(list(dressed.inside.values())))
+    lines = [f"{choice.method}: {cost}", f"{inside:.2f} % of vertices inside the body"]
+    lines.append(_known_error(choice))
+    # Escaped, because a note may contain a file name and the page renders HTML.
+    lines += [html.escape(note) for note in dressed.notes]
+    return dressed.garments, lines
+
+
+def _compared(
+    choice: Choice,
+    clip: Motion,
+    garments: tuple[AnimatedMesh, ...],
+    progress: Progress | None,
+) -> tuple[tuple[AnimatedMesh, ...], dict[str, np.ndarray]]:
+    """The simulation beside the garments, and the distances to it [m]."""
+    standard = dataclasses.replace(choice.simulation, accuracy="standard")
+    reference, _ = _simulated(dataclasses.replace(choice, simulation=standard), clip, progress)
+    by_name = {m.name: m.positions for m in reference}
+    return reference, {
+        m.name: np.linalg.norm(m.positions - by_name[m.name], axis=2) for m in garments
+    }
+
+
 def _simulated(
     choice: Choice, clip: Motion, progress: Progress | None
 ) -> tuple[tuple[AnimatedMesh, ...], float]:
-    also: list[Effect] = []
-    if any(choice.wind):
-        also.append(Air(wind=choice.wind))
-    if choice.self_contact:
-        also.append(SelfContact())
-    job = make_scene(clip, choice.wear, fabric=choice.fabric, shape=_shape(choice), also=also)
+    wear = with_default_fabric(choice.wear, choice.fabric)
+    job = make_scene(clip, wear, simulation=choice.simulation, shape=_shape(choice))
     began = time.perf_counter()
-    rollout = simulate_batch(
-        prepare_scene(job.scene),
-        [clip],
-        solver=ACCURACY[choice.accuracy].at_rate(clip.fps),
-        progress=None if progress is None else functools.partial(progress, "simulation"),
-    )[0]
-    rollout.check()
+    rollout = run_simulation(job.scene, clip, choice.simulation, progress=progress)
     took = 1e3 * (time.perf_counter() - began) / clip.num_frames
     names = [g.name for g in job.scene.garments]
     positions = dict(zip(names, rollout.positions, strict=True))
@@ -265,13 +266,11 @@ def _simulated(
 
 
 def _known_error(choice: Choice) -> str:
-    """The error that was measured for this way to dress, whatever is shown."""
-    name = "lbs" if choice.method == "lbs" else choice.weights
-    if choice.push_out and choice.method == "network":
-        name += "+push"
-    for rung in load_ladder():
-        if rung.name == name:
-            errors = ", ".join(f"{t} {e:.1f}" for t, e in rung.rmse_mm.items())
+    """The tabulated error of this method, which doesn't depend on the clip."""
+    name = "lbs" if choice.method == "lbs" else method_name(choice.inference)
+    for profile in load_cost_table():
+        if profile.name == name:
+            errors = ", ".join(f"{t} {e:.1f}" for t, e in profile.rmse_mm.items())
             return f"RMSE over the twelve test actions: {errors} mm"
     return ""
 
@@ -282,9 +281,9 @@ def _shape(choice: Choice) -> Any | None:
 
 @functools.lru_cache(4)
 def _predictor(weights: str, shape: tuple[tuple[str, float], ...], sha256: str) -> Predictor:
-    """Kept as long as the weights of that name stay what they are."""
+    """Loads a predictor; the checksum invalidates the cache when the weights change."""
     del sha256
     body = load_body()
     params = body.shape(**dict(shape)) if shape else None
     rest = body.rest_vertices(body.default_shape() if params is None else params)
-    return fit_surface(load_predictor(weights), body, rest)
+    return with_body(load_predictor(weights), body, rest)

@@ -1,4 +1,4 @@
-"""Clothes that are computed in the moment they are looked at."""
+"""Garments that are computed frame by frame while they are shown."""
 
 import collections
 import functools
@@ -10,29 +10,28 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..dressing import clothe_frame, make_dresser, start_clothing
+from ..dressing import Inference, clothe_step, init_stream, make_dresser
 from ..motion import Motion
 
-# Frames over whose times a median is taken.
+# Number of recent frames whose median time is reported.
 _RECENT = 30
 
 
 class Live:
-    """A clip's clothes by the streaming form: one frame in, one frame out.
+    """Computes a clip's garments by the streaming form: one frame in, one frame out.
 
-    Any frame may be asked for; those that follow one another cost one step each. After a
-    jump the frames that the network sees of the past are gone through first, so that
-    what is shown is what the whole clip at once gives.
+    Any frame may be requested; consecutive frames cost one step each. After a jump the
+    network's window of past frames is processed first, so that the result equals that of
+    the whole clip at once.
 
     Args:
         motion: The clip.
         wear: Templates and garment files.
-        weights: Which network.
+        inference: Weights and post-processing.
         shape: Shape parameters of the body; the default shape if None.
-        push_out: Push vertices that end inside the body onto it.
 
     Raises:
-        PhysXNetError: Anything that can't be read or bound; the text says why.
+        PhysXNetError: An input can't be read or bound; the text gives the reason.
     """
 
     def __init__(
@@ -40,17 +39,16 @@ class Live:
         motion: Motion,
         wear: tuple[str, ...],
         *,
-        weights: str,
+        inference: Inference,
         shape: Float[Array, " shapes"] | None = None,
-        push_out: bool = True,
     ) -> None:
         self._motion = motion
-        self._dresser = make_dresser(wear, weights=weights, shape=shape, push_out=push_out)
+        self._dresser = make_dresser(wear, inference=inference, shape=shape)
         self._step = _step(motion.fps)
-        self._start = jax.jit(start_clothing)
+        self._start = jax.jit(init_stream)
         self._times: collections.deque[float] = collections.deque(maxlen=_RECENT)
         self._next = -1
-        # What is compiled isn't what a frame takes.
+        # The first frame compiles: its time is dropped.
         self.frame(0)
         self._times.clear()
 
@@ -62,7 +60,7 @@ class Live:
     def frame(self, index: int) -> dict[str, Float[np.ndarray, "vertices 3"]]:
         """Vertices of every garment in a frame of the clip [m]."""
         if index != self._next:
-            window = self._dresser.predictor.config.inputs.window
+            window = self._dresser.history_length + 1
             first = max(index + 1 - window, 0)
             rows = np.minimum(np.arange(first, first + window), self._motion.num_frames - 1)
             self._stream = self._start(self._dresser, *self._pose(rows))
@@ -81,5 +79,5 @@ class Live:
 
 @functools.lru_cache(4)
 def _step(fps: float) -> Callable:
-    """Compiled once for all clips of a rate."""
-    return jax.jit(functools.partial(clothe_frame, fps=fps), donate_argnums=1)
+    """The jitted step, compiled once for all clips of a frame rate."""
+    return jax.jit(functools.partial(clothe_step, fps=fps), donate_argnums=1)

@@ -18,8 +18,8 @@ def texel_picture(
 
     Args:
         values: Its covered texels.
-        texels: Where they are, row by row.
-        resolution: Texels a side.
+        texels: Their indices, row by row.
+        resolution: Texels per side.
     """
     scale = max(float(np.quantile(np.abs(values), 0.98)), 1e-9)
     flat = np.full((resolution * resolution, 3), 255, np.uint8)
@@ -34,30 +34,30 @@ def frame_maps(
     fps: float,
     templates: Sequence[str],
 ) -> dict[str, UInt8[np.ndarray, "height width 3"]]:
-    """What the network sees of a frame and what it answers, as pictures.
+    """The network's inputs and outputs for a frame, as pictures.
 
     Args:
         predictor: The network.
         world: World rotations of joints, the window's last frame being the one shown.
         shift: World translations of joints [m].
-        fps: Frames a second.
-        templates: Which garments' maps.
+        fps: Frames per second.
+        templates: Garments whose maps are drawn.
 
     Returns:
         Pictures by name: velocity, acceleration, then an offset map for each template.
     """
     inputs = predictor.config.inputs
-    seen, told = _maps(predictor, world, shift, fps, tuple(dict.fromkeys(templates)))
+    features, offset_maps = _maps(predictor, world, shift, fps, tuple(dict.fromkeys(templates)))
     texels = np.asarray(predictor.atlas.texels)
     out, start = {}, 0
     for kind in inputs.kinds:
         width = inputs.width(kind)
         if kind in ("velocity", "acceleration"):
             # The last of the window's frames is the one shown.
-            last = np.asarray(seen)[:, start + width - 3 : start + width]
+            last = np.asarray(features)[:, start + width - 3 : start + width]
             out[kind] = texel_picture(last, texels, predictor.config.resolution)
         start += width
-    for name, offsets in told.items():
+    for name, offsets in offset_maps.items():
         out[name] = texel_picture(np.asarray(offsets), texels, predictor.config.resolution)
     return out
 
@@ -66,16 +66,16 @@ def frame_maps(
 def _maps(
     predictor: Predictor, world: Array, shift: Array, fps: float, templates: tuple[str, ...]
 ) -> Any:
-    surface = predictor.surface
-    seen = clip_features(surface.rest, surface.weights, world, shift, fps, predictor.config.inputs)[
-        0
-    ]
-    return seen, jax.tree.map(lambda x: x[0], predictor(world, shift, fps, templates))
+    texel_points = predictor.texel_points
+    features = clip_features(
+        texel_points.rest, texel_points.weights, world, shift, fps, predictor.config.inputs
+    )[0]
+    return features, jax.tree.map(lambda x: x[0], predictor(world, shift, fps, templates))
 
 
 def magnified(
     picture: UInt8[np.ndarray, "height width 3"], size: int
 ) -> UInt8[np.ndarray, "size size 3"]:
-    """The picture at another size, texels as squares."""
+    """Resizes a picture with nearest-neighbour sampling, so that texels stay squares."""
     pick = np.arange(size) * len(picture) // size
     return picture[pick][:, pick]

@@ -1,4 +1,4 @@
-"""Still pictures and videos of dressed people, off screen."""
+"""Off-screen rendering of dressed people: pictures and videos."""
 
 import importlib.util
 import io
@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from ..errors import FormatError, MissingDependencyError
-from ..files import check_writable, whole_file
+from ..files import atomic_write, check_writable
 from ..geometry import Texture
 from ..io import AnimatedMesh, smooth_normals
 
 PREVIEWS = (".mp4", ".gif", ".png")
-# Height that is shown at least, floor included [m].
+# Minimum height of the view above the floor [m].
 _SPAN = 1.8
 
 
@@ -27,7 +27,7 @@ def _plotter(size: tuple[int, int]) -> Any:
         raise MissingDependencyError(
             "Pictures need pyvista: pip install 'physxnet-jax[render]'."
         ) from error
-    # Without a display VTK tries X first and complains; it then falls back to EGL.
+    # Without a display VTK tries X first and logs errors; it then falls back to EGL.
     if "DISPLAY" not in os.environ:
         import vtk
 
@@ -38,7 +38,7 @@ def _plotter(size: tuple[int, int]) -> Any:
 
 
 class _Stage:
-    """A scene whose meshes are moved from frame to frame."""
+    """A scene whose meshes are updated from frame to frame."""
 
     def __init__(
         self, meshes: Sequence[AnimatedMesh], size: tuple[int, int], title: str = ""
@@ -51,7 +51,7 @@ class _Stage:
         self.meshes = meshes
         self.images: dict[Texture, Any] = {}
         self.floor = float(min(m.positions[..., 1].min() for m in meshes))
-        # High jumps and raised arms stay in the picture.
+        # High jumps and raised arms have to stay in view.
         top = float(max(m.positions[..., 1].max() for m in meshes))
         self.span = max(top - self.floor, _SPAN)
         path = np.concatenate([m.positions.mean(axis=1) for m in meshes[:1]])
@@ -66,7 +66,7 @@ class _Stage:
         )
         self.plotter.add_mesh(ground, color="#b9bec4", show_edges=True, edge_color="#a4a9b0")
 
-    def shoot(self, frame: int) -> np.ndarray:
+    def draw(self, frame: int) -> np.ndarray:
         """One frame as an RGB image."""
         import pyvista
 
@@ -74,14 +74,14 @@ class _Stage:
         for k, m in enumerate(self.meshes):
             looks = m.looks
             if any(look.texture is not None for look in looks):
-                self._put_images(k, m, frame)
+                self._add_textured(k, m, frame)
                 continue
-            painted: dict[str, Any] = {"color": looks[0].colour}
+            colour_options: dict[str, Any] = {"color": looks[0].colour}
             if len(looks) > 1:
-                paint = np.zeros((len(m.faces), 3), np.uint8)
+                face_colours = np.zeros((len(m.faces), 3), np.uint8)
                 for look in looks:
-                    paint[look.faces] = np.round(255 * np.asarray(look.colour))
-                painted = {"scalars": paint, "rgb": True}
+                    face_colours[look.faces] = np.round(255 * np.asarray(look.colour))
+                colour_options = {"scalars": face_colours, "rgb": True}
             # Named meshes replace the last frame's; smooth shading needs new normals anyway.
             self.plotter.add_mesh(
                 pyvista.PolyData.from_regular_faces(m.positions[frame].copy(), m.faces),
@@ -90,18 +90,18 @@ class _Stage:
                 specular=0.1,
                 reset_camera=False,
                 backface_params={"color": tuple(0.6 * c for c in looks[0].colour)},
-                **painted,
+                **colour_options,
             )
         target = np.array([centre[0], self.floor + 0.5 * self.span, centre[2]])
         eye = target + np.array([1.3, 0.5, 3.4]) * (self.span / _SPAN)
         self.plotter.camera_position = [tuple(eye), tuple(target), (0.0, 1.0, 0.0)]
         self.plotter.camera.view_angle = 32.0
-        # A screenshot alone would show the meshes from where the camera stood before.
+        # A screenshot alone would show the meshes from the camera's previous position.
         self.plotter.render()
         return np.asarray(self.plotter.screenshot(return_img=True))
 
-    def _put_images(self, k: int, m: AnimatedMesh, frame: int) -> None:
-        """A mesh of which some faces have images, each look as a mesh of its own."""
+    def _add_textured(self, k: int, m: AnimatedMesh, frame: int) -> None:
+        """Adds a mesh of which some faces are textured, with a separate mesh for each look."""
         import pyvista
 
         normals = smooth_normals(m.positions[frame : frame + 1], m.faces)[0]
@@ -114,7 +114,7 @@ class _Stage:
             image = None
             if look.texture is not None and m.uv is not None and m.uv_faces is not None:
                 part.active_texture_coordinates = m.uv[m.uv_faces[look.faces].reshape(-1)]
-                image = self._image(look.texture)
+                image = self._load_texture(look.texture)
             self.plotter.add_mesh(
                 part,
                 name=f"mesh{k}_{n}",
@@ -125,14 +125,14 @@ class _Stage:
                 reset_camera=False,
             )
 
-    def _image(self, texture: Texture) -> Any:
+    def _load_texture(self, texture: Texture) -> Any:
         import imageio.v2 as imageio
         import pyvista
 
         if texture not in self.images:
             try:
                 pixels = np.asarray(imageio.imread(io.BytesIO(texture.data or b"")))
-            # A damaged image is none.
+            # A damaged image is replaced by grey.
             except Exception:
                 pixels = np.full((1, 1, 3), 200, np.uint8)
             if pixels.dtype == np.uint16:
@@ -156,7 +156,7 @@ def render_frame(
     """
     stage = _Stage(meshes, size)
     try:
-        return stage.shoot(frame)
+        return stage.draw(frame)
     finally:
         stage.plotter.close()
 
@@ -169,14 +169,14 @@ def render_preview(
     size: tuple[int, int] = (480, 544),
     progress: Callable[[str, int, int], None] | None = None,
 ) -> pathlib.Path:
-    """Renders a clip: ``.mp4``, ``.gif``, or ``.png`` (a sheet of six moments).
+    """Renders a clip: ``.mp4``, ``.gif``, or ``.png`` (a contact sheet of six frames).
 
     Args:
-        path: Where to; written whole or not at all.
-        meshes: What to show.
-        fps: Frames a second.
+        path: Output file, written atomically.
+        meshes: Meshes to render.
+        fps: Frames per second.
         size: Width and height of a frame; multiples of 16 for video.
-        progress: Called with a text, frames done and frames in all.
+        progress: Called with a text, the frames done and the total.
 
     Raises:
         FormatError: Another extension.
@@ -193,15 +193,15 @@ def render_columns(
     size: tuple[int, int] = (480, 544),
     progress: Callable[[str, int, int], None] | None = None,
 ) -> pathlib.Path:
-    """Renders clips of the same motion side by side, from the same place.
+    """Renders clips of the same motion side by side, from the same viewpoint.
 
     Args:
-        path: ``.mp4``, ``.gif``, or ``.png`` (six moments, a row for each column's
-            title); written whole or not at all.
-        columns: What to show, by the title to show it under.
-        fps: Frames a second.
+        path: ``.mp4``, ``.gif``, or ``.png`` (six frames, a row for each column's title);
+            written atomically.
+        columns: Meshes to render, by the title above them.
+        fps: Frames per second.
         size: Width and height of one column; multiples of 16 for video.
-        progress: Called with a text, frames done and frames in all.
+        progress: Called with a text, the frames done and the total.
 
     Raises:
         FormatError: Another extension, or clips of different lengths.
@@ -210,7 +210,9 @@ def render_columns(
     path = check_preview(path)
     lengths = {len(meshes[0].positions) for meshes in columns.values()}
     if len(lengths) != 1:
-        raise FormatError(f"clips to compare have {sorted(lengths)} frames; they must be alike.")
+        raise FormatError(
+            f"clips to compare have {sorted(lengths)} frames; the numbers must be equal."
+        )
     try:
         import imageio.v2 as imageio
     except ImportError as error:
@@ -222,12 +224,12 @@ def render_columns(
     try:
         for title, meshes in columns.items():
             stages.append(_Stage(meshes, size, title))
-        with whole_file(path) as part, warnings.catch_warnings():
-            # ffmpeg is started by fork and exec: nothing of JAX runs in between.
+        with atomic_write(path) as part, warnings.catch_warnings():
+            # ffmpeg is started by fork and exec: no JAX code runs in between.
             warnings.filterwarnings("ignore", message=".*os.fork.*")
             if path.suffix.lower() == ".png":
-                picks = np.unique(np.linspace(0, frames - 1, 6).astype(int))
-                rows = [np.concatenate([s.shoot(int(k)) for k in picks], axis=1) for s in stages]
+                sampled = np.unique(np.linspace(0, frames - 1, 6).astype(int))
+                rows = [np.concatenate([s.draw(int(k)) for k in sampled], axis=1) for s in stages]
                 imageio.imwrite(part, np.concatenate(rows, axis=0))
                 return path
             stride = 1 if path.suffix.lower() == ".mp4" else max(1, round(fps / 15))
@@ -238,7 +240,7 @@ def render_columns(
             )
             with imageio.get_writer(part, **options) as writer:
                 for k in range(0, frames, stride):
-                    shot = np.concatenate([s.shoot(k) for s in stages], axis=1)
+                    shot = np.concatenate([s.draw(k) for s in stages], axis=1)
                     writer.append_data(shot)  # pyright: ignore[reportAttributeAccessIssue]
                     if progress is not None:
                         progress("preview", k + 1, frames)
@@ -249,10 +251,10 @@ def render_columns(
 
 
 def check_preview(path: str | pathlib.Path) -> pathlib.Path:
-    """The path, if its extension is one that can be rendered and there is what renders it.
+    """Checks that a preview can be rendered to a path, and returns the path.
 
     Raises:
-        FormatError: Another extension, or a place where nothing can be written.
+        FormatError: Another extension, or the path isn't writable.
         MissingDependencyError: Without the ``render`` extra.
     """
     path = pathlib.Path(path)

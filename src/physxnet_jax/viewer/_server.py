@@ -9,7 +9,7 @@ from ..errors import MissingDependencyError
 
 
 def start_server(host: str, port: int) -> Any:
-    """A viser server that says nothing.
+    """Starts a viser server without console output.
 
     Raises:
         MissingDependencyError: Without the ``viewer`` extra.
@@ -20,9 +20,9 @@ def start_server(host: str, port: int) -> Any:
         raise MissingDependencyError(
             "The viewer needs viser: pip install 'physxnet-jax[viewer]'."
         ) from error
-    # A browser that goes away while connecting is nothing to report.
+    # A browser that disconnects while connecting isn't worth a report.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
-    # It prints a banner whatever it is told.
+    # viser prints a banner despite verbose=False.
     with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction("+y")

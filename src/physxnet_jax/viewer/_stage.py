@@ -1,4 +1,4 @@
-"""A dressed clip on a viser scene: bodies by their bones, garments by their vertices."""
+"""A dressed clip in a viser scene: bones move the bodies, garments are updated by vertex."""
 
 from typing import Any
 
@@ -11,16 +11,16 @@ from ..io import AnimatedMesh
 from ._job import Shown
 
 BESIDE = np.array([-1.1, 0.0, 0.0], np.float32)
-"""Where the reference stands [m]."""
+"""Displacement of the reference from the clip [m]."""
 
 FARTHEST = 0.06
-"""Distance that is shown in the strongest colour [m]."""
+"""Distance at the end of the colour scale [m]."""
 
 _SKIN = (176, 117, 84)
 
 
 class Stage:
-    """What is on a scene, moved from frame to frame.
+    """The meshes of a clip in a scene, updated from frame to frame.
 
     Attributes:
         shown: The clip.
@@ -49,11 +49,11 @@ class Stage:
     def show(
         self, frame: int, worn: dict[str, Float[np.ndarray, "vertices 3"]] | None = None
     ) -> None:
-        """Moves all to a frame.
+        """Shows a frame.
 
         Args:
-            frame: Which one.
-            worn: Vertices of garments [m] where they aren't to be those of the clip.
+            frame: Index of the frame.
+            worn: Vertices of garments [m] that replace those of the clip.
         """
         shown = self.shown
         turns = Rotation.from_matrix(shown.world[frame]).as_quat(scalar_first=True)
@@ -70,7 +70,7 @@ class Stage:
                 dots.colors = heat(shown.distances[mesh.name][frame])
 
     def clear(self) -> None:
-        """Takes all off the scene."""
+        """Removes all meshes from the scene."""
         for handle in (*self._bodies, *(h for _, _, h in self._meshes), *self._dots.values()):
             handle.remove()
 
@@ -88,7 +88,7 @@ class Stage:
         )
 
     def _mesh(self, mesh: AnimatedMesh, folder: str) -> Any:
-        # Display colours are linear, a browser's aren't.
+        # Display colours are linear; a browser expects gamma-encoded ones.
         most = max(mesh.looks, key=lambda look: len(look.faces)).colour
         colour = tuple(int(255 * c ** (1 / 2.2)) for c in most)
         if mesh.name in self.shown.distances and not folder:

@@ -1,4 +1,4 @@
-"""The viewer in a browser: choose, watch, compare, take away."""
+"""The viewer in the browser: choose, play, compare, export."""
 
 import contextlib
 import dataclasses
@@ -17,22 +17,15 @@ from typing import Any
 import numpy as np
 
 from ..body import load_body
-from ..dressing import METHODS
+from ..dressing import METHODS, Inference, Simulation
 from ..errors import FormatError, PhysXNetError
-from ..files import whole_file
+from ..files import atomic_write
 from ..garment import FABRICS, TEMPLATES
-from ..io import (
-    EXTENSIONS,
-    GARMENT_FORMATS,
-    MIRROR,
-    RELAX,
-    list_weights,
-    split_ways,
-    write_clip,
-)
-from ..motion import CLIPS, GltfFile
-from ..simulation import ACCURACY
-from ._job import Choice, Shown, carry_out, check_choice
+from ..io import EXTENSIONS, GARMENT_FORMATS, GltfFile, write_clip
+from ..models import list_weights
+from ..motion import CLIPS
+from ..simulation import PRESETS
+from ._job import Choice, Shown, check_choice, run_job
 from ._maps import magnified
 from ._server import start_server
 from ._stage import Stage
@@ -42,19 +35,19 @@ _MAP_SIZE = 192
 
 
 class _Superseded(Exception):
-    """Something else has been chosen meanwhile."""
+    """A newer choice has replaced this one."""
 
 
 class Viewer:
     """A web page on which a person is dressed.
 
-    The page is one for all who look at it. What is chosen is computed in the background,
-    the latest choice first; what was shown stays until the new one is ready.
+    All browsers share one page. The latest choice is computed in the background; the
+    previous result stays visible until the new one is ready.
 
     Args:
-        choice: What is shown at first.
-        host: Address to listen at; by default only this machine can connect.
-        port: Port to listen at; the next free one is taken.
+        choice: Initial settings.
+        host: Address to listen on; by default only this machine can connect.
+        port: Port to listen on; the next free one is used.
 
     Raises:
         MissingDependencyError: Without the ``viewer`` extra.
@@ -66,17 +59,17 @@ class Viewer:
         self.shown: Shown | None = None
         self._stage: Stage | None = None
         self._lock = threading.RLock()
-        self._wanted: Choice | None = None
+        self._requested: Choice | None = None
         self._settled: Choice | None = None
-        self._news = threading.Event()
-        self._over = threading.Event()
+        self._wake = threading.Event()
+        self._closed = threading.Event()
         self._folder = tempfile.TemporaryDirectory(prefix="physxnet-view-")
         self._files: dict[str, pathlib.Path] = {}
-        self._first = choice
+        self._initial = choice
         self._pictures: dict[str, Any] = {}
         self._build(choice)
         self._threads = [
-            threading.Thread(target=run, daemon=True) for run in (self._work, self._play)
+            threading.Thread(target=run, daemon=True) for run in (self._compute, self._play)
         ]
         for thread in self._threads:
             thread.start()
@@ -84,24 +77,26 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://{self.server.get_host()}:{self.server.get_port()}"
 
     def chosen(self) -> Choice:
-        """What the page's controls say."""
+        """The settings of the page's controls."""
         w = self._widgets
         body = load_body()
-        ordinary = dict(zip(body.shape_names, np.asarray(body.default_shape()), strict=True))
+        defaults = dict(zip(body.shape_names, np.asarray(body.default_shape()), strict=True))
         shape = tuple(
             (name, float(handle.value))
             for name, handle in self._shapes.items()
-            if abs(handle.value - ordinary[name]) > 1e-6
+            if abs(handle.value - defaults[name]) > 1e-6
         )
         motion = str(w["motion"].value)
         motion = str(self._files.get(motion, motion))
-        first = self._first
-        # What was said of one file isn't true of another.
+        first = self._initial
+        # Options of the first motion file don't apply to another one.
         known = motion == str(pathlib.Path(first.motion))
+        height = first.simulation.wind[1] if first.simulation.wind else 0.0
+        wind = (float(w["wind_x"].value), height, float(w["wind_z"].value))
         return dataclasses.replace(
             first,
             motion=motion,
@@ -110,41 +105,48 @@ class Viewer:
             joint_map=first.joint_map if known else None,
             wear=self._wear(),
             method=w["method"].value,
-            weights="".join((w["weights"].value, *(x for x in (MIRROR, RELAX) if w[x].value))),
-            push_out=w["push_out"].value,
+            inference=Inference(
+                weights=w["weights"].value,
+                tta=w["tta"].value,
+                strain_iterations=self._iterations if w["strain"].value else 0,
+                collisions=w["collisions"].value,
+            ),
             compare=w["compare"].value,
             live=w["live"].value,
             shape=shape,
-            accuracy=w["accuracy"].value,
             fabric=None if w["fabric"].value == "as cut" else w["fabric"].value,
-            wind=(float(w["wind_x"].value), self._first.wind[1], float(w["wind_z"].value)),
-            self_contact=w["self_contact"].value,
+            simulation=Simulation(
+                accuracy=w["accuracy"].value,
+                engine=first.simulation.engine,
+                wind=wind if any(wind) else None,
+                self_contact=w["self_contact"].value,
+            ),
             frames=int(w["frames"].value),
         )
 
     def _wear(self) -> tuple[str, ...]:
-        """What is ticked, in the order of the command: of two of one kind the first is beneath."""
+        """The ticked garments in command-line order: of one type, later ones are outer."""
         ticked = [str(self._files.get(n, n)) for n, box in self._worn.items() if box.value]
-        return tuple(sorted(ticked, key=[*self._first.wear, *ticked].index))
+        return tuple(sorted(ticked, key=[*self._initial.wear, *ticked].index))
 
     def ask(self) -> None:
-        """Has what is chosen computed."""
+        """Requests the computation of the current settings."""
         with self._lock:
-            self._wanted = self.chosen()
-            self._news.set()
+            self._requested = self.chosen()
+            self._wake.set()
 
     def wait(self, seconds: float = 600.0) -> Shown:
-        """Waits until what is chosen is shown.
+        """Waits until the current settings are shown.
 
         Raises:
-            PhysXNetError: What went wrong, or that it takes too long.
+            PhysXNetError: The computation failed or takes too long.
         """
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             with self._lock:
-                # A box is ticked a moment before anybody has asked for what it means.
-                settled = self._wanted is None and self._settled == self.chosen()
-                if settled and not self._news.is_set():
+                # A control changes shortly before its callback requests the computation.
+                settled = self._requested is None and self._settled == self.chosen()
+                if settled and not self._wake.is_set():
                     if self._failed is not None:
                         raise self._failed
                     if self.shown is not None:
@@ -153,27 +155,27 @@ class Viewer:
         raise PhysXNetError(f"Nothing to show after {seconds:g} seconds.")
 
     def add_file(self, name: str, content: bytes) -> None:
-        """A motion or a garment that was dropped in.
+        """Adds an uploaded motion or garment.
 
         Raises:
-            FormatError: Another kind of file.
+            FormatError: The file is of another kind.
         """
-        # Only the last part, in plain characters: a name from the net is no path.
+        # Only the last part, in plain characters: an uploaded name must not act as a path.
         name = re.sub(r"[^\w.-]", "_", pathlib.PurePosixPath(name.replace("\\", "/")).name)
         suffix = pathlib.Path(name).suffix.lower()
         if suffix not in (*_MOTIONS, *GARMENT_FORMATS, ".asf") or name.startswith("."):
             raise FormatError(
-                f"{name}: not a motion ({', '.join(_MOTIONS)}) nor a garment"
+                f"{name}: neither a motion ({', '.join(_MOTIONS)}) nor a garment"
                 f" ({', '.join(GARMENT_FORMATS)})."
             )
         path = pathlib.Path(self._folder.name) / name
-        with whole_file(path) as part:
+        with atomic_write(path) as part:
             part.write_bytes(content)
         if suffix == ".asf":
-            # The AMC that asked for it may be there already.
+            # The AMC file that needs it may already be there.
             self.ask()
             return
-        # A glTF in which nothing moves is a garment.
+        # A glTF file without animations is a garment.
         moves = suffix in _MOTIONS
         if moves and suffix in GARMENT_FORMATS:
             moves = bool(GltfFile(path).document.animations)
@@ -188,10 +190,10 @@ class Viewer:
         self.ask()
 
     def export(self, suffix: str) -> tuple[str, bytes]:
-        """What is shown as a file of this format; several as one archive.
+        """Exports what is shown in this format; several files as one ZIP archive.
 
         Returns:
-            Name and content.
+            Name and content of the file.
         """
         shown = self.wait()
         with tempfile.TemporaryDirectory() as folder:
@@ -207,9 +209,9 @@ class Viewer:
             return archive.name, archive.read_bytes()
 
     def close(self) -> None:
-        """Ends the page and what is being computed."""
-        self._over.set()
-        self._news.set()
+        """Stops the page and the running computation."""
+        self._closed.set()
+        self._wake.set()
         for thread in self._threads:
             thread.join(timeout=30.0)
         with contextlib.redirect_stdout(io.StringIO()):
@@ -225,17 +227,15 @@ class Viewer:
         self._failed: PhysXNetError | None = None
         w: dict[str, Any] = {}
         with gui.add_folder("Motion"):
-            there = tuple(CLIPS)
-            if choice.motion not in there:
+            clips = tuple(CLIPS)
+            if choice.motion not in clips:
                 name = pathlib.Path(choice.motion).name
                 self._files[name] = pathlib.Path(choice.motion)
-                there, first = (*there, name), name
+                clips, first = (*clips, name), name
             else:
                 first = choice.motion
-            w["motion"] = gui.add_dropdown("clip", there, initial_value=first)
-            w["frames"] = gui.add_slider(
-                "frames at most", 1, max(600, choice.frames), 1, choice.frames
-            )
+            w["motion"] = gui.add_dropdown("clip", clips, initial_value=first)
+            w["frames"] = gui.add_slider("max frames", 1, max(600, choice.frames), 1, choice.frames)
             upload = gui.add_upload_button("add motion or garment")
         self._clothes = gui.add_folder("Garments")
         self._worn: dict[str, Any] = {}
@@ -244,50 +244,53 @@ class Viewer:
                 short = name
                 if name not in TEMPLATES:
                     path = pathlib.Path(name)
-                    # Two files of one name are told apart by where they are.
+                    # Files of the same name are distinguished by their paths.
                     short = name if path.name in self._files else path.name
                     self._files[short] = path
                 self._add_garment(short, name in choice.wear)
         with gui.add_folder("Cloth"):
             w["method"] = gui.add_dropdown("method", METHODS, initial_value=choice.method)
-            name, ways = split_ways(choice.weights)
+            name, inference = str(choice.inference.weights), choice.inference
+            self._iterations = inference.strain_iterations or Inference().strain_iterations
             w["weights"] = gui.add_dropdown(
                 "network", tuple(dict.fromkeys((*list_weights(), name))), initial_value=name
             )
-            w[MIRROR] = gui.add_checkbox("mirrored person too", MIRROR in ways)
-            w[RELAX] = gui.add_checkbox("lengths of edges", RELAX in ways)
-            w["push_out"] = gui.add_checkbox("push out of the body", choice.push_out)
-            w["compare"] = gui.add_checkbox("simulation beside it", choice.compare)
-            w["live"] = gui.add_checkbox("clothe live, as it plays", choice.live)
+            w["tta"] = gui.add_checkbox("average with mirrored pose", inference.tta)
+            w["strain"] = gui.add_checkbox("limit strain", inference.strain_iterations > 0)
+            w["collisions"] = gui.add_checkbox("resolve collisions", inference.collisions)
+            w["compare"] = gui.add_checkbox("compare with simulation", choice.compare)
+            w["live"] = gui.add_checkbox("live inference", choice.live)
             self._pace = gui.add_markdown("", visible=False)
-        strongest = max(10.0, *map(abs, choice.wind))
-        reach = (-strongest, strongest, 0.5)
-        with gui.add_folder("When simulating", expand_by_default=False):
+        simulation = choice.simulation
+        wind = simulation.wind or (0.0, 0.0, 0.0)
+        strongest = max(10.0, *map(abs, wind))
+        wind_range = (-strongest, strongest, 0.5)
+        with gui.add_folder("Simulation", expand_by_default=False):
             w["accuracy"] = gui.add_dropdown(
-                "accuracy", tuple(ACCURACY), initial_value=choice.accuracy
+                "accuracy", tuple(PRESETS), initial_value=simulation.accuracy
             )
             w["fabric"] = gui.add_dropdown(
                 "fabric", ("as cut", *FABRICS), initial_value=choice.fabric or "as cut"
             )
-            w["wind_x"] = gui.add_slider("wind from the right, m/s", *reach, choice.wind[0])
-            w["wind_z"] = gui.add_slider("wind from behind, m/s", *reach, choice.wind[2])
-            w["self_contact"] = gui.add_checkbox("self-contact", choice.self_contact)
+            w["wind_x"] = gui.add_slider("wind from the right, m/s", *wind_range, wind[0])
+            w["wind_z"] = gui.add_slider("wind from behind, m/s", *wind_range, wind[2])
+            w["self_contact"] = gui.add_checkbox("self-contact", simulation.self_contact)
         self._shapes: dict[str, Any] = {}
-        body, told = load_body(), dict(choice.shape)
+        body, overrides = load_body(), dict(choice.shape)
         with gui.add_folder("Body", expand_by_default=False):
             for name, x in zip(body.shape_names, np.asarray(body.default_shape()), strict=True):
-                value = round(told.get(name, float(x)), 2)
+                value = round(overrides.get(name, float(x)), 2)
                 self._shapes[name] = gui.add_slider(
                     name.replace("_", " "), min(0.0, value), max(1.0, value), 0.05, value
                 )
         with gui.add_folder("Play"):
             self._playing = gui.add_checkbox("play", True)
             self._frame = gui.add_slider("frame", 0, max(choice.frames - 1, 1), 1, 0)
-            self._show_maps = gui.add_checkbox("maps of the network", False)
+            self._show_maps = gui.add_checkbox("network maps", False)
             self._maps_folder = gui.add_folder("Maps", visible=False)
-        with gui.add_folder("Take away"):
+        with gui.add_folder("Export"):
             kind = gui.add_dropdown("format", tuple(EXTENSIONS), initial_value=".usdc")
-            take = gui.add_button("export")
+            export_button = gui.add_button("export")
         self._widgets = w
         for handle in (*w.values(), *self._shapes.values()):
             handle.on_update(lambda _: self.ask())
@@ -296,17 +299,17 @@ class Viewer:
 
         @upload.on_upload
         def _(event: Any) -> None:
-            with self._telling():
+            with self._reporting_errors():
                 self.add_file(event.target.value.name, event.target.value.content)
 
-        @take.on_click
+        @export_button.on_click
         def _(event: Any) -> None:
-            take.disabled = True
+            export_button.disabled = True
             try:
-                with self._telling():
+                with self._reporting_errors():
                     event.client.send_file_download(*self.export(kind.value))
             finally:
-                take.disabled = False
+                export_button.disabled = False
 
     def _add_garment(self, name: str, worn: bool) -> None:
         if name in self._worn:
@@ -317,33 +320,33 @@ class Viewer:
         self._worn[name] = box
 
     @contextlib.contextmanager
-    def _telling(self) -> Iterator[None]:
-        """Errors of what the user asked for are shown on the page."""
+    def _reporting_errors(self) -> Iterator[None]:
+        """Shows errors of the user's actions on the page."""
         try:
             yield
         except (PhysXNetError, OSError) as error:
-            self._tell(error)
+            self._report_error(error)
 
-    def _tell(self, error: Exception) -> None:
-        """Shows an error as plain text: it may quote a file, and the page takes HTML."""
+    def _report_error(self, error: Exception) -> None:
+        """Shows an error as plain text: it may quote a file, and the page renders HTML."""
         text = html.escape(str(error))
         self._status.content = "**" + re.sub(r"([\\`*_{}\[\]()#!|])", r"\\\1", text) + "**"
 
-    def _work(self) -> None:
+    def _compute(self) -> None:
         while True:
-            self._news.wait()
+            self._wake.wait()
             with self._lock:
-                self._news.clear()
-                choice = self._wanted
-            if self._over.is_set():
+                self._wake.clear()
+                choice = self._requested
+            if self._closed.is_set():
                 return
             if choice is None:
                 continue
             failed: PhysXNetError | None = None
             try:
-                shown = carry_out(choice, self._tick)
-                self._put(shown)
-                self._status.content = shown.told
+                shown = run_job(choice, self._report_progress)
+                self._display(shown)
+                self._status.content = shown.summary
             except _Superseded:
                 continue
             except PhysXNetError as error:
@@ -352,18 +355,18 @@ class Viewer:
                 traceback.print_exc()
                 failed = PhysXNetError(f"{type(error).__name__}: {error}")
             if failed is not None:
-                self._tell(failed)
+                self._report_error(failed)
             with self._lock:
                 self._failed, self._settled = failed, choice
-                if not self._news.is_set():
-                    self._wanted = None
+                if not self._wake.is_set():
+                    self._requested = None
 
-    def _tick(self, stage: str, done: int, total: int) -> None:
-        if self._news.is_set() or self._over.is_set():
+    def _report_progress(self, stage: str, done: int, total: int) -> None:
+        if self._wake.is_set() or self._closed.is_set():
             raise _Superseded
         self._status.content = f"{stage}: {done} of {total} frames …"
 
-    def _put(self, shown: Shown) -> None:
+    def _display(self, shown: Shown) -> None:
         with self._lock, self.server.atomic():
             if self._stage is not None:
                 self._stage.clear()
@@ -382,10 +385,10 @@ class Viewer:
             with self.server.atomic():
                 self._stage.show(frame, worn)
             self._pace.visible = live is not None
-            # A number that changes with every frame can't be read.
+            # A number that changes with every frame would be unreadable.
             if live is not None and frame % 10 == 0:
                 self._pace.content = f"{live.milliseconds:.1f} ms a frame, live"
-            # While playing only now and then: they cost more than the frame.
+            # While playing, maps are drawn every tenth frame: they cost more than the frame.
             if self._show_maps.value != self._maps_folder.visible:
                 self._maps_folder.visible = self._show_maps.value
             if self._show_maps.value and (not self._playing.value or frame % 10 == 0):
@@ -406,18 +409,18 @@ class Viewer:
 
     def _play(self) -> None:
         due = time.monotonic()
-        while not self._over.is_set():
+        while not self._closed.is_set():
             shown = self.shown
             if shown is None or not self._playing.value or not self.server.get_clients():
-                self._over.wait(0.1)
+                self._closed.wait(0.1)
                 due = time.monotonic()
                 continue
             try:
                 # Setting the slider shows the frame.
                 self._frame.value = (int(self._frame.value) + 1) % shown.num_frames
             except Exception as error:
-                # One frame that can't be shown doesn't end the clip.
-                self._tell(error)
+                # A frame that can't be shown stops playback, but not this thread.
+                self._report_error(error)
                 self._playing.value = False
             due = max(due + 1.0 / shown.clip.fps, time.monotonic() - 1.0)
-            self._over.wait(max(due - time.monotonic(), 0.0))
+            self._closed.wait(max(due - time.monotonic(), 0.0))

@@ -13,21 +13,23 @@ from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import (
     STANDARD,
     XPBD,
-    Bend,
     Clock,
+    Scene,
+    Status,
+    prepare_scene,
+    settle_on_static_body,
+    simulate,
+)
+from physxnet_jax.simulation.effects import (
+    Bend,
     Gravity,
     LayerContact,
     Pin,
-    Scene,
     Seam,
     SelfContact,
-    Status,
     Stretch,
-    prepare_scene,
-    simulate,
-    simulate_still,
 )
-from physxnet_jax.simulation.effects._pairs import Pairs, keep_apart
+from physxnet_jax.simulation.effects._pairs import Pairs, separate_pairs
 
 STEPS = XPBD(32, 4)
 
@@ -40,21 +42,22 @@ def two_sheets(n=8, size=0.3):
     return free_garment(v, f, pinned=np.arange(n * n)), n * n
 
 
-def test_a_sheet_lands_on_another_of_the_same_garment():
+@pytest.mark.release
+def test_self_contact_stops_a_falling_sheet_on_another():
     g, first = two_sheets()
     effects = (Gravity(), Stretch(), SelfContact(gap=0.004), Pin())
-    out = simulate_still(prepare_scene(Scene((g,), effects)), 20, solver=STEPS)
+    out = settle_on_static_body(prepare_scene(Scene((g,), effects)), 20, solver=STEPS)
     above = out.positions[0][:, first:, 1]
     assert above[-1].min() > 0.003
     assert above.min() > 0.0, "never below, on the way either"
     assert np.abs(np.diff(above[-3:], axis=0)).max() < 2e-3, "it lies still"
     # It stops where it lands; without self-contact it falls through.
     none = tuple(e for e in effects if not isinstance(e, SelfContact))
-    free = simulate_still(prepare_scene(Scene((g,), none)), 20, solver=STEPS)
+    free = settle_on_static_body(prepare_scene(Scene((g,), none)), 20, solver=STEPS)
     assert free.positions[0][-1, first:, 1].max() < -0.5
 
 
-def test_the_grid_finds_the_nearest_on_either_side():
+def test_grid_search_finds_the_nearest_vertex_on_each_side():
     """Against all pairs, for a crumpled cloud; a cell that is too small says so."""
     rng = np.random.default_rng(0)
     g = square_sheet(12, 0.5)
@@ -78,18 +81,19 @@ def test_the_grid_finds_the_nearest_on_either_side():
     assert int(tiny.nearest(jnp.asarray(x))[1]) > 0
 
 
-def test_self_contact_that_touches_nothing_changes_no_bit():
+def test_self_contact_without_contacts_is_bitwise_neutral():
     g = square_sheet(6)
     plain = (Gravity(), Stretch(), Pin())
     runs = [
-        simulate_still(prepare_scene(Scene((g,), e)), 5, solver=STEPS).positions[0]
+        settle_on_static_body(prepare_scene(Scene((g,), e)), 5, solver=STEPS).positions[0]
         for e in (plain, (*plain[:2], SelfContact(), Pin()))
     ]
     np.testing.assert_array_equal(*runs)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("start", [0.03, -0.01], ids=["outside", "inside"])
-def test_layers_keep_their_order_or_get_it_back(start):
+def test_layers_keep_or_regain_their_order(start):
     """Upright sheets before the body; the outer one is thrown at the inner one, or
     begins behind it, and ends before it."""
     inner = square_sheet(10, 0.3, upright=True, pinned=np.arange(100))
@@ -98,13 +102,13 @@ def test_layers_keep_their_order_or_get_it_back(start):
     scene = prepare_scene(Scene((inner, outer), effects))
     v = np.zeros((149, 3))
     v[100:, 2] = -1.0 if start > 0 else 0.0
-    out = simulate_still(scene, 12, solver=STEPS, velocity=v)
+    out = settle_on_static_body(scene, 12, solver=STEPS, velocity=v)
     front = out.positions[1][-1][:, 2] - 1.5
     assert front.min() > 0.002
     assert (out.diagnostics["layers_crossed"][-1] == 0).all()
     if start > 0:
         free = prepare_scene(Scene((inner, outer), (Stretch(), Pin())))
-        through = simulate_still(free, 12, solver=STEPS, velocity=v)
+        through = settle_on_static_body(free, 12, solver=STEPS, velocity=v)
         assert through.positions[1][-1][:, 2].max() < 1.4
     else:
         assert out.status[0] & Status.CROSSED, "said while it lasts"
@@ -127,7 +131,8 @@ def beyond(inner, outer, faces):
     return height[(height > 5e-4) & ~hem]
 
 
-def test_a_top_stays_outside_the_trousers():
+@pytest.mark.release
+def test_top_stays_outside_the_trousers():
     motion = load_motion("walk", fps=30.0)
     motion = dataclasses.replace(motion, rotations=motion.rotations[:10], root=motion.root[:10])
     effects = (*STANDARD[:4], LayerContact(), *STANDARD[4:])
@@ -147,12 +152,12 @@ def test_a_top_stays_outside_the_trousers():
     assert len(beyond(out_of, top, faces)) > 100
 
 
-def test_seams_draw_panels_together():
+def test_seams_close_the_gap_between_panels():
     left = square_sheet(6, 0.2, upright=True, pinned=np.arange(0, 36, 6))
     right = square_sheet(6, 0.2, upright=True, corner=(0.24, 0.0, 1.5))
     edge = tuple((6 * i + 5, 36 + 6 * i) for i in range(6))
     scene = prepare_scene(Scene((left, right), (Stretch(), Seam(edge), Pin())))
-    out = simulate_still(scene, 45, solver=STEPS)
+    out = settle_on_static_body(scene, 45, solver=STEPS)
     a, b = (np.asarray(edge)[:, k] for k in range(2))
     gap = np.linalg.norm(out.positions[0][-1][a] - out.positions[1][-1][b - 36], axis=1)
     assert gap.max() < 2e-3
@@ -160,19 +165,20 @@ def test_seams_draw_panels_together():
         prepare_scene(Scene((left, right), (Seam(((0, 99),)),)))
 
 
-def test_contact_of_cloth_needs_no_clock():
+def test_cloth_contact_does_not_depend_on_absolute_time():
     """The gap a pair keeps doesn't depend on where in time the block lies."""
     g, _ = two_sheets()
     e = prepare_scene(Scene((g,), (SelfContact(),))).effects[0]
     x = e.rest[:, :, None]
     pairs = [
-        e.begin(x, None, None, Clock(jnp.float32(t), 0.01), e.initial(1)).pairs for t in (0.0, 5.0)
+        e.begin(x, None, None, Clock(jnp.float32(t), 0.01), e.init_state(1)).pairs
+        for t in (0.0, 5.0)
     ]
     np.testing.assert_array_equal(pairs[0].height, pairs[1].height)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3, 10.0])
-def test_cloth_that_is_pressed_on_cloth_slides_as_far_as_friction_lets_it(friction):
+def test_friction_limits_sliding_of_cloth_on_cloth(friction):
     """A vertex 3 mm too deep that slid by 10 mm over a held triangle."""
     one = lambda *x: jnp.asarray(x, jnp.float32)  # noqa: E731
     pairs = Pairs(
@@ -188,13 +194,15 @@ def test_cloth_that_is_pressed_on_cloth_slides_as_far_as_friction_lets_it(fricti
     mass = one(1, 0, 0, 0)[:, None, None]
     law = SelfContact(gap=0.002, friction=friction, leave=1.0)
     clock = Clock(jnp.float32(0.0), 1.0)
-    out = np.asarray(keep_apart(moved, start, pairs, mass, law, clock, jnp.float32(1.0)))[..., 0]
+    out = np.asarray(separate_pairs(moved, start, pairs, mass, law, clock, jnp.float32(1.0)))[
+        ..., 0
+    ]
     left = 0.010 - min(friction * 0.003, 0.010)
     np.testing.assert_allclose(out[0], [left, 0.001, 0.0], atol=1e-6)
     assert not out[1:].any()
 
 
-def test_self_contact_is_of_each_garment_with_itself():
+def test_self_contact_is_within_each_garment_only():
     """A sheet a millimetre above another: as one garment they meet, as two they don't."""
     low, high = square_sheet(6, 0.2), square_sheet(6, 0.2, corner=(0.0, 0.001, 1.5))
     v = np.concatenate([np.asarray(g.mesh.vertices) for g in (low, high)])
@@ -207,7 +215,7 @@ def test_self_contact_is_of_each_garment_with_itself():
 
 
 @pytest.mark.parametrize(("limbs", "meet"), [((1, 0), True), ((3, 0), True), ((3, 1), False)])
-def test_layers_meet_where_limbs_adjoin(limbs, meet):
+def test_layer_contact_is_active_only_between_adjacent_limbs(limbs, meet):
     """A sleeve by the hip is no layer over the trousers' leg."""
     low, high = square_sheet(6, 0.2), square_sheet(6, 0.2, corner=(0.0, 0.002, 1.5))
     scene = prepare_scene(Scene((low, high), (LayerContact(),)))
@@ -215,5 +223,5 @@ def test_layers_meet_where_limbs_adjoin(limbs, meet):
     layers = dataclasses.replace(layers, label=jnp.repeat(jnp.asarray(limbs, jnp.int32), 36))
     x = jnp.asarray(scene.assembly.rest, jnp.float32)[:, :, None]
     clock = Clock(jnp.float32(0.0), 0.01)
-    pairs = layers.begin(x, None, None, clock, layers.initial(1)).pairs
+    pairs = layers.begin(x, None, None, clock, layers.init_state(1)).pairs
     assert bool((pairs.active > 0).any()) == meet

@@ -14,17 +14,14 @@ from physxnet_jax.motion import Motion, animate, load_motion
 from physxnet_jax.simulation import (
     STANDARD,
     XPBD,
-    BodyContact,
     Clock,
-    Gravity,
-    Pin,
-    Placed,
+    PosedPoints,
     Scene,
-    Stretch,
     prepare_scene,
+    settle_on_static_body,
     simulate,
-    simulate_still,
 )
+from physxnet_jax.simulation.effects import BodyContact, Gravity, Pin, Stretch
 
 FPS = 30.0
 CLOCK = Clock(jnp.float32(0.0), 1 / 120)
@@ -36,17 +33,18 @@ def skin_at(body, rest, motion, frame):
     return animate(body, rest, rest[every], body.weights[every], part)[0]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", ["top", "bottom", "dress"])
-def test_the_foot_is_the_closest_point_of_the_whole_body(body, rest, name):
+def test_closest_skin_point_matches_brute_force(body, rest, name):
     """Against brute force in the rest pose; misses are counted, and shallow."""
     scene = prepare_scene(Scene((template(name),), (BodyContact(),)))
     contact = scene.effects[0]
     x = jnp.asarray(scene.assembly.rest.astype(np.float32))
-    skin = contact.attached
+    skin = contact.skinned_points
     placed = dataclasses.replace(
         _placed(skin), points=skin.rest[:, :, None], normals=skin.normals[:, :, None]
     )
-    begin = jax.jit(lambda x, at: contact.begin(x, at, at, CLOCK, contact.initial(1)))
+    begin = jax.jit(lambda x, at: contact.begin(x, at, at, CLOCK, contact.init_state(1)))
     context = begin(x[:, :, None], placed)
     mine = np.linalg.norm(np.asarray(context.where)[..., 0], axis=1)
     mesh = body.mesh(rest[:NUM_BODY_VERTICES])
@@ -57,10 +55,10 @@ def test_the_foot_is_the_closest_point_of_the_whole_body(body, rest, name):
     assert missed.mean() < 0.02, missed.mean()
 
 
-def _placed(attached):
-    from physxnet_jax.simulation._effect import Placed
+def _placed(skinned):
+    from physxnet_jax.simulation._effect import PosedPoints
 
-    return Placed(attached.rest[:, :, None], attached.normals[:, :, None])
+    return PosedPoints(skinned.rest[:, :, None], skinned.normals[:, :, None])
 
 
 def fast(motion, factor):
@@ -70,7 +68,8 @@ def fast(motion, factor):
     )
 
 
-def test_nothing_tunnels_through_a_punch_at_eight_times_its_speed():
+@pytest.mark.release
+def test_contact_prevents_tunnelling_in_a_punch_at_eight_times_speed():
     motion = fast(load_motion("punch", fps=FPS), 8)
     out = simulate(Scene((template("top"),)), motion)
     assert out.diagnostics["penetration_max"].max() < 2e-3
@@ -82,7 +81,8 @@ def test_nothing_tunnels_through_a_punch_at_eight_times_its_speed():
     assert np.abs(free.positions[0] - out.positions[0]).max() > 0.05
 
 
-def test_cloth_that_starts_inside_comes_out_gently(body, rest):
+@pytest.mark.release
+def test_cloth_that_starts_inside_leaves_at_bounded_speed(body, rest):
     """10 mm inside: out within a frame, no faster than the cap allows."""
     g = template("bottom")
     scene = prepare_scene(Scene((g,), (BodyContact(), Pin())))
@@ -93,17 +93,18 @@ def test_cloth_that_starts_inside_comes_out_gently(body, rest):
     foot = np.einsum("vk,vkc->vc", np.asarray(hit.weights), np.asarray(mesh.vertices)[tri])
     away = (x - foot) / np.linalg.norm(x - foot, axis=1, keepdims=True)
     sunk = foot - 0.010 * away
-    out = simulate_still(scene, 5, solver=XPBD(32, 4), start=sunk)
+    out = settle_on_static_body(scene, 5, solver=XPBD(32, 4), start=sunk)
     d = out.diagnostics
     assert d["penetration_max"][0] < 1e-3
     # Set down, not shot away: at the cap, a metre a second, at most a few cm travelled.
     assert d["speed_max"][1:].max() < 1.5
     reckless = prepare_scene(Scene((g,), (BodyContact(leave=1e6), Pin())))
-    wild = simulate_still(reckless, 5, solver=XPBD(32, 4), start=sunk)
+    wild = settle_on_static_body(reckless, 5, solver=XPBD(32, 4), start=sunk)
     assert wild.diagnostics["speed_max"][0] > 3.0
 
 
-def test_cloth_follows_its_own_skin_across_a_sharp_fold(body, rest):
+@pytest.mark.release
+def test_cloth_follows_its_own_limb_across_a_sharp_fold(body, rest):
     """A knee bent by 150 degrees: thigh and calf pass through each other, each keeps
     its own cloth, and the cloth comes back when the leg is stretched again."""
     frames = 24
@@ -125,12 +126,13 @@ def test_cloth_follows_its_own_skin_across_a_sharp_fold(body, rest):
     assert np.median(gap) < 0.01
 
 
-def test_limbs_share_the_room_between_them(body, rest):
+@pytest.mark.release
+def test_pinched_cloth_lies_between_overlapping_limbs(body, rest):
     """An arm pressed into the trunk: the cloth of both lies in the middle of the overlap."""
     scene = prepare_scene(Scene((template("top"),), (BodyContact(),)))
     contact = scene.effects[0]
     pinch = contact.pinch
-    calm = pinch.room(_placed(contact.attached))[:, 0]
+    calm = pinch.room(_placed(contact.skinned_points))[:, 0]
     # The control: with the arms away from the body nothing is pinched.
     assert calm.min() > 0.0
     pose = np.asarray(body.a_pose()).copy()
@@ -142,7 +144,7 @@ def test_limbs_share_the_room_between_them(body, rest):
         turned[joint] = [np.cos(half), 0.0, 0.0, np.sin(half)]
         heads = body.joint_positions(rest)[0]
         motion = Motion(jnp.asarray(turned[None], jnp.float32), heads[:1], FPS, "pressed")
-        skin = contact.attached
+        skin = contact.skinned_points
         points = animate(body, rest, skin.rest, skin.weights, motion)[0]
         along = animate(body, rest, skin.rest + 1e-3 * skin.normals, skin.weights, motion)[0]
         normals = 1e3 * (along - points)
@@ -169,15 +171,16 @@ def test_limbs_share_the_room_between_them(body, rest):
     assert out.diagnostics["strain_p99"].max() < 0.5
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("push", [1e-3, 1.0])
-def test_no_correction_is_larger_than_asked_for(push):
+def test_contact_corrections_are_bounded_by_the_push_setting(push):
     """Trousers 12 mm in the skin, one substep."""
     g = template("bottom")
     (contact,) = prepare_scene(Scene((g,), (BodyContact(push=push),))).effects
     x = g.mesh.vertices - 0.012 * vertex_normals(g.mesh.vertices, g.mesh.faces)
-    skin = Placed(contact.skin.rest[:, :, None], contact.skin.normals[:, :, None])
+    skin = PosedPoints(contact.skin.rest[:, :, None], contact.skin.normals[:, :, None])
     begun = contact.begin(
-        x[:, :, None], skin, skin, Clock(jnp.float32(0.0), 0.01), contact.initial(1)
+        x[:, :, None], skin, skin, Clock(jnp.float32(0.0), 0.01), contact.init_state(1)
     )
     still = jnp.zeros((len(x), 3, 1))
     moved = contact.project(still, still, begun, jnp.float32(1.0), (0.001, 1.0))
@@ -185,16 +188,16 @@ def test_no_correction_is_larger_than_asked_for(push):
     assert far == pytest.approx(push, rel=1e-3) if push < 0.01 else 0.005 < far < 0.03
 
 
-def test_cloth_that_goes_along_with_the_skin_does_not_rub():
+def test_cloth_moving_with_the_skin_has_no_friction():
     """Trousers 2 mm too deep on skin that moves sideways by a centimetre, as they do."""
     g = template("bottom")
     (contact,) = prepare_scene(Scene((g,), (BodyContact(),))).effects
     x = g.mesh.vertices - 0.004 * vertex_normals(g.mesh.vertices, g.mesh.faces)
     way = jnp.asarray([0.006, 0.0, 0.008], jnp.float32)[None, :, None]
     points, normals = contact.skin.rest[:, :, None], contact.skin.normals[:, :, None]
-    before, after = Placed(points, normals), Placed(points + way, normals)
+    before, after = PosedPoints(points, normals), PosedPoints(points + way, normals)
     clock = Clock(jnp.float32(0.0), 0.01)
-    begun = contact.begin(x[:, :, None], before, after, clock, contact.initial(1))
+    begun = contact.begin(x[:, :, None], before, after, clock, contact.init_state(1))
     still = jnp.zeros((len(x), 3, 1))
     unit = begun.unit
     for moved, rubs in ((still + way, False), (still, True)):
@@ -204,12 +207,12 @@ def test_cloth_that_goes_along_with_the_skin_does_not_rub():
         assert (float(jnp.abs(along).max()) > 1e-4) == rubs
 
 
-def test_far_from_the_body_cloth_falls_as_if_there_were_none():
+def test_contact_does_not_affect_cloth_far_from_the_body():
     """No height counts as limited where nothing limits it: ten metres away, say."""
     mesh = square_sheet(4, 0.3).mesh
     sheet = free_garment(np.asarray(mesh.vertices) + [0.0, 14.0, 0.0], np.asarray(mesh.faces))
     falls = [
-        simulate_still(
+        settle_on_static_body(
             prepare_scene(Scene((sheet,), effects)), 8, solver=XPBD(8, 1), fps=FPS
         ).positions[0]
         for effects in ((Gravity(), Stretch()), (Gravity(), Stretch(), BodyContact()))

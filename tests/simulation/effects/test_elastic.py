@@ -6,21 +6,17 @@ import numpy as np
 import pytest
 
 from physxnet_jax.garment import Fabric, free_garment, square_sheet
-from physxnet_jax.simulation import (
-    XPBD,
+from physxnet_jax.simulation import XPBD, Clock, Scene, prepare_scene, settle_on_static_body
+from physxnet_jax.simulation.effects import (
     Bend,
-    Clock,
     Dihedral,
     Gravity,
     Membrane,
     Pin,
-    Scene,
     StrainLimit,
     Stretch,
-    prepare_scene,
-    simulate_still,
 )
-from physxnet_jax.simulation.effects._coloured import Coloured
+from physxnet_jax.simulation.effects._colored import Colored
 
 FABRIC = Fabric(stretch=300.0, bend=1e-4, warp=400.0, weft=200.0, shear=30.0)
 CLOCK = Clock(jnp.float32(0.0), 0.01)
@@ -57,7 +53,7 @@ def turned(x, seed):
 
 @pytest.mark.parametrize("effect", ELASTIC)
 @pytest.mark.parametrize("seed", [0, 1])
-def test_rigid_motion_stores_no_energy_and_changes_none(effect, seed):
+def test_elastic_energy_is_invariant_to_rigid_motion(effect, seed):
     e, rest = prepared(effect, square_sheet(5, 0.2, fabric=FABRIC))
     bent = rest + np.random.default_rng(seed).normal(size=rest.shape) * 0.004
     reference = float(energy(e, rest, bent))
@@ -68,7 +64,7 @@ def test_rigid_motion_stores_no_energy_and_changes_none(effect, seed):
 
 @pytest.mark.parametrize("direction", [0, 2])
 @pytest.mark.parametrize("strain", [0.1, -0.1])
-def test_membrane_patch_test(direction, strain):
+def test_membrane_passes_the_patch_test(direction, strain):
     """Uniform stretch along warp (z, level sheet) and weft (x): E = 1/2 Y A strain^2."""
     e, rest = prepared(Membrane(compression=0.5), square_sheet(4, 0.2, fabric=FABRIC))
     x = rest.copy()
@@ -78,7 +74,7 @@ def test_membrane_patch_test(direction, strain):
     assert float(energy(e, rest, x)) == pytest.approx(expected, rel=1e-4)
 
 
-def test_membrane_shear_is_the_angle_between_the_threads():
+def test_membrane_shear_energy_matches_the_thread_angle():
     e, rest = prepared(Membrane(), square_sheet(4, 0.2, fabric=FABRIC))
     angle = 0.1
     x = rest.copy()
@@ -90,7 +86,7 @@ def test_membrane_shear_is_the_angle_between_the_threads():
     assert float(energy(e, rest, x)) == pytest.approx(expected, rel=1e-3)
 
 
-def test_springs_are_as_stiff_as_the_sheet_they_stand_for():
+def test_spring_stiffness_matches_an_isotropic_sheet():
     """A regular spring mesh is an isotropic sheet of Poisson's ratio 1/3: stretched
     both ways it stores Y A strain^2 / (1 - 1/3)."""
     e, rest = prepared(Stretch(compression=1.0), square_sheet(21, 0.4, fabric=FABRIC))
@@ -112,7 +108,7 @@ def rolled(rest, angle, radius):
 
 @pytest.mark.parametrize("effect", [Bend(), Dihedral()])
 @pytest.mark.parametrize("n", [17, 33])
-def test_cylinders_along_warp_and_weft_store_half_k_kappa_squared_an_area(effect, n):
+def test_cylinder_bending_energy_matches_the_analytic_value(effect, n):
     size, radius = 0.2, 0.15
     e, rest = prepared(effect, square_sheet(n, size, fabric=FABRIC))
     # Free edges have no hinge: a third of their triangles' area stores nothing.
@@ -154,7 +150,7 @@ def strip(kind, columns, rows):
 
 
 @pytest.mark.parametrize("kind", ["grid", "alternating", "equilateral", "irregular"])
-def test_a_clamped_strip_sags_like_a_beam_however_it_is_cut(kind):
+def test_clamped_strip_deflects_like_a_beam_for_any_triangulation(kind):
     """Small deflections: stiffness k, load q an area, tip at q L^4 / 8 k."""
     v, faces = strip(kind, 9, 17)
     e, rest = prepared(Bend(), free_garment(v, faces, fabric=Fabric(bend=1.0)))
@@ -178,9 +174,9 @@ def test_a_clamped_strip_sags_like_a_beam_however_it_is_cut(kind):
 
 
 @pytest.mark.parametrize("effect", [Membrane(), Dihedral(), StrainLimit()])
-def test_gradients_of_constraints_are_those_of_their_values(effect):
+def test_constraint_gradients_match_autodiff(effect):
     e, rest = prepared(effect, square_sheet(4, 0.1, fabric=FABRIC))
-    assert isinstance(e, Coloured)
+    assert isinstance(e, Colored)
     x = rest + np.random.default_rng(3).normal(size=rest.shape) * 0.02
     base = jnp.asarray(rest, jnp.float32)[:, :, None]
     context = begun(e, base)
@@ -201,8 +197,9 @@ def test_gradients_of_constraints_are_those_of_their_values(effect):
             assert gap < 2e-3 * scale
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("effect", ELASTIC)
-def test_hessians_are_symmetric_positive_and_near_the_energys(effect):
+def test_hessians_are_symmetric_semidefinite_and_near_the_exact_one(effect):
     e, rest = prepared(effect, square_sheet(3, 0.1, fabric=FABRIC))
     count = len(rest)
     # In tension: what the blocks leave out there is small.
@@ -228,13 +225,14 @@ def test_hessians_are_symmetric_positive_and_near_the_energys(effect):
     assert np.abs(full - exact).max() < 0.1 * np.abs(exact).max()
 
 
-def test_a_strain_limit_holds_what_springs_alone_do_not():
+@pytest.mark.release
+def test_strain_limit_bounds_strain_where_springs_do_not():
     weak = Fabric(stretch=1.0, bend=1e-6)
     g = square_sheet(6, 0.3, upright=True, pinned=np.arange(6), fabric=weak)
 
     def worst(*limit):
         scene = prepare_scene(Scene((g,), (Gravity(), Stretch(), Bend(), *limit, Pin())))
-        out = simulate_still(scene, 30, solver=XPBD(32, 2))
+        out = settle_on_static_body(scene, 30, solver=XPBD(32, 2))
         rest = np.asarray(g.mesh.vertices)
         x = out.positions[0][-1]
         return max(
@@ -248,7 +246,7 @@ def test_a_strain_limit_holds_what_springs_alone_do_not():
     assert worst(StrainLimit(0.05)) < 1.08
 
 
-def test_slivers_and_collapsed_triangles_keep_value_and_gradient_finite():
+def test_values_and_gradients_are_finite_for_degenerate_triangles():
     v = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 1e-9, 0], [0, 0, 0.1], [0, 0, 0.1]], float)
     g = free_garment(v, np.array([[0, 1, 2], [0, 1, 3], [0, 3, 4]]))
     for effect in (*ELASTIC, StrainLimit()):
@@ -268,9 +266,10 @@ def test_slivers_and_collapsed_triangles_keep_value_and_gradient_finite():
                 assert np.isfinite(float(value)) and np.isfinite(np.asarray(slope)).all()
 
 
+@pytest.mark.nightly
 @pytest.mark.parametrize("effect", [Stretch(), Membrane()])
 @pytest.mark.parametrize("apart", [0.0, 1e-10, 1e-7])
-def test_ends_that_coincide_keep_a_finite_gradient_from_sweep_to_sweep(effect, apart):
+def test_gradients_of_repeated_sweeps_are_finite_for_coincident_ends(effect, apart):
     """They have no direction to be parted in: as many sweeps as a frame has must not blow it up."""
     v = np.array([[0, 0, 0], [0.02, 0, 0], [0, 0, 0.02]], float)
     e, rest = prepared(effect, free_garment(v, np.array([[0, 1, 2]])))
@@ -290,20 +289,21 @@ def test_ends_that_coincide_keep_a_finite_gradient_from_sweep_to_sweep(effect, a
     assert np.abs(np.asarray(slope)).max() > 1e-3
 
 
-def test_a_membrane_of_slivers_alone_says_nothing_of_itself():
+def test_membrane_of_degenerate_triangles_reports_no_diagnostics():
     v = np.array([[0, 0, 0], [0.1, 0, 0], [0.2, 1e-9, 0]], float)
     e, rest = prepared(Membrane(), free_garment(v, np.array([[0, 1, 2]])))
     base = jnp.asarray(rest, jnp.float32)[:, :, None]
     assert e.diagnose(jnp.zeros_like(base), begun(e, base)) == {}
 
 
-def test_what_two_effects_say_of_strain_is_the_worse_of_both():
+@pytest.mark.release
+def test_strain_diagnostic_is_the_maximum_over_effects():
     sheet = square_sheet(4, 0.3, pinned=np.arange(4), fabric=FABRIC)
-    told = {}
+    reported = {}
     for effects in ((Stretch(),), (Membrane(),), (Stretch(), Membrane()), (Membrane(), Stretch())):
         scene = prepare_scene(Scene((sheet,), (Gravity(), *effects, Pin())))
-        info = simulate_still(scene, 3, solver=XPBD(4, 1), fps=30.0).diagnostics
-        told[tuple(type(e).__name__ for e in effects)] = info["strain_max"]
-    both = told["Stretch", "Membrane"]
-    assert (both > 0).any() and not np.array_equal(told["Stretch",], told["Membrane",])
-    np.testing.assert_allclose(both, told["Membrane", "Stretch"], atol=5e-3)
+        info = settle_on_static_body(scene, 3, solver=XPBD(4, 1), fps=30.0).diagnostics
+        reported[tuple(type(e).__name__ for e in effects)] = info["strain_max"]
+    both = reported["Stretch", "Membrane"]
+    assert (both > 0).any() and not np.array_equal(reported["Stretch",], reported["Membrane",])
+    np.testing.assert_allclose(both, reported["Membrane", "Stretch"], atol=5e-3)

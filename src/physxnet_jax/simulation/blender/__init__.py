@@ -1,4 +1,4 @@
-"""Blender's cloth as a second engine, out of process: it is the paper's own teacher."""
+"""Blender's cloth simulator as an external engine; it is the paper's teacher."""
 
 from ._engine import (
     BlenderSettings as BlenderSettings,

@@ -1,4 +1,4 @@
-"""Effects, one file each. A scene holds the ones it calls for and nothing else."""
+"""The effects that a scene can list, one module each."""
 
 from ._air import Air as Air
 from ._bend import Bend as Bend

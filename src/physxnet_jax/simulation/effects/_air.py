@@ -1,4 +1,4 @@
-"""Air: drag against still air or wind, steady, gusting or turbulent."""
+"""Air: drag in still air or in steady, gusting or turbulent wind."""
 
 import dataclasses
 from typing import Any
@@ -14,31 +14,33 @@ from ...errors import check_numbers
 from ...geometry import spread_points, vertex_faces, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Attached, Clock, Effect, Placed, Prepared
+from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints
 
 
 @dataclasses.dataclass(frozen=True)
 class Air(Effect):
-    """``a = -rho A / (2 m) |u| (C_n u_n + C_t u_t)`` with ``u`` the speed through the air.
+    """``a = -rho A / (2 m) |u| (C_n u_n + C_t u_t)`` with ``u`` the velocity in the air.
 
-    ``u_n`` is its part along the cloth's normal, ``u_t`` the rest. Normals and the
-    wind's field are those at the start of a block. The step is implicit in ``|u|``, so
-    that no wind is strong enough to make it unstable. Cloth near skin that faces away from
-    the wind lies in the body's lee: there the mean wind is weaker, and dies away towards the
-    skin. That is no flow around a body, but without it the lee side is blown off the skin as
-    hard as the other is pressed on.
+    ``u_n`` is the part of ``u`` along the cloth's normal, ``u_t`` the rest. Normals and the
+    wind field are those at the start of a contact interval. The step is linearly implicit in
+    ``u``, so it is stable in any wind.
+
+    Cloth near skin that faces away from the wind lies in the lee of the body: there the mean
+    wind is weaker, and weakest at the skin. This doesn't model the flow around a body. Without
+    it, cloth on the lee side would be blown off the skin as hard as cloth on the windward side
+    is pressed onto it.
 
     Attributes:
         wind: Mean wind [m/s].
-        gust: The mean wind swells and fades by this share.
-        period: Of gusts [s].
+        gust: Amplitude of the gusts, relative to the mean wind [1].
+        period: Period of the gusts [s].
         turbulence: Root mean square of the turbulent velocity [m/s].
         eddy: Size of the largest eddies [m].
-        seed: Of the turbulence.
-        density: Of air [kg/m^3].
-        normal: Drag coefficient across the cloth [1].
-        tangent: Along it [1].
-        shelter: Share of the mean wind that is kept off where skin faces straight away
+        seed: Random seed of the turbulence.
+        density: Density of the air [kg/m^3].
+        normal: Drag coefficient normal to the cloth [1].
+        tangent: Drag coefficient along the cloth [1].
+        shelter: Share of the mean wind that is blocked at skin that faces straight away
             from it [1].
 
     References:
@@ -68,7 +70,7 @@ class Air(Effect):
             raise ValueError(f"shelter is {self.shelter}, expected a share from 0 to 1")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Tables of faces around vertices; modes of turbulence if there is any."""
+        """Builds tables of the faces around vertices, and modes if there is turbulence."""
         x, f = assembly.rest, assembly.faces
         area = 0.5 * np.linalg.norm(
             np.cross(x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]]), axis=1
@@ -76,7 +78,7 @@ class Air(Effect):
         share = np.zeros(len(x))
         np.add.at(share, f, (area / 3)[:, None])
         around = vertex_faces(f, len(x))
-        # The table repeats faces where a vertex has few; each counts once.
+        # The table repeats faces of vertices that have few; each must count once.
         count = np.bincount(f.ravel(), minlength=len(x))
         once = np.arange(around.shape[1])[None] < count[:, None]
         modes = None
@@ -101,46 +103,45 @@ class Air(Effect):
         )
 
     def _lee(self, assembly: Assembly) -> "_Lee | None":
-        """Skin that may keep the wind off each vertex; nothing for cloth that isn't worn."""
+        """Skin points that may shelter each vertex; None without wind or near skin."""
         if not (any(self.wind) and self.shelter > 0):
             return None
         skin = assembly.rest_body[:NUM_BODY_VERTICES]
-        some = spread_points(skin, _SPACING)
-        far, near = KDTree(skin[some]).query(assembly.rest, k=_NEAR)
+        samples = spread_points(skin, _SPACING)
+        far, near = KDTree(skin[samples]).query(assembly.rest, k=_NEIGHBOURS)
         if far.min() > _REACH:
             return None
         used, local = np.unique(near, return_inverse=True)
-        rows = some[used]
+        rows = samples[used]
         faces = jnp.asarray(np.asarray(triangulate(assembly.body.quads)))
-        attached = Attached(
+        skinned_points = SkinnedPoints(
             float32(skin[rows]),
             vertex_normals(float32(skin), faces)[jnp.asarray(rows)],
             assembly.body.weights[jnp.asarray(rows)],
         )
-        return _Lee(attached, jnp.asarray(local.reshape(near.shape).astype(np.int32)))
+        return _Lee(skinned_points, jnp.asarray(local.reshape(near.shape).astype(np.int32)))
 
 
 _MODES = 16
-# Skin that is looked at, one point in so many metres; how many for each vertex; and how far its
-# lee reaches [m].
-_SPACING, _NEAR, _REACH = 0.05, 4, 0.15
+# Distance between skin samples [m], number of samples per vertex, and reach of their lee [m].
+_SPACING, _NEIGHBOURS, _REACH = 0.05, 4, 0.15
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Lee:
-    skin: Attached
+    skin: SkinnedPoints
     near: Int[Array, "vertices k"]
 
-    def shade(self, base: Array, placed: Placed, wind: tuple[float, ...]) -> Array:
-        """How deep in the lee each vertex is, 0 to 1, shape [vertices, 1, batch]."""
+    def shade(self, base: Array, placed: PosedPoints, wind: tuple[float, ...]) -> Array:
+        """Sheltering of each vertex, from 0 to 1, shape [vertices, 1, batch]."""
         way = np.asarray(wind) / np.linalg.norm(wind)
         gap = placed.points[self.near] - base[:, None]
-        # Computed once: the derivative of a minimum looks for what is equal to it.
+        # Keep XLA from recomputing this: the gradient of `min` compares for equality.
         squared = jax.lax.optimization_barrier(jnp.sum(gap * gap, axis=2))
         facing = jnp.sum(placed.normals * jnp.asarray(way, base.dtype)[None, :, None], axis=1)
         least = jnp.min(squared, axis=1, keepdims=True)
-        # The normals of all that are about as near: one would make seams where it changes.
+        # Average the normals of all nearly closest samples; a single one would cause jumps.
         share = jnp.exp((least - squared) / (2 * (0.5 * _SPACING) ** 2))
         away = jnp.sum(share * facing[self.near], axis=1) / jnp.sum(share, axis=1)
         distance = jnp.sqrt(least[:, 0] + 1e-12)
@@ -159,26 +160,31 @@ class _Air(Prepared):
     law: Air = dataclasses.field(metadata={"static": True})
 
     @property
-    def attached(self) -> Attached | None:
+    def skinned_points(self) -> SkinnedPoints | None:
         return None if self.lee is None else self.lee.skin
 
     def begin(
-        self, base: Array, start: Placed | None, end: Placed | None, clock: Clock, memory: Any
+        self,
+        base: Array,
+        start: PosedPoints | None,
+        end: PosedPoints | None,
+        clock: Clock,
+        state: Any,
     ) -> tuple[Array, Array]:
         a, b, c = (base[self.faces[:, k]] for k in range(3))
         normal = jnp.cross(b - a, c - a, axis=1)
         total = jnp.sum(normal[self.around] * self.once, axis=1)
         unit = total / jnp.sqrt(jnp.sum(total * total, axis=1, keepdims=True) + 1e-18)
-        swell = 1.0 + self.law.gust * jnp.sin(2 * jnp.pi / self.law.period * clock.time)
+        gust_factor = 1.0 + self.law.gust * jnp.sin(2 * jnp.pi / self.law.period * clock.time)
         mean = jnp.asarray(self.law.wind, base.dtype)[None, :, None]
-        wind = jnp.broadcast_to(swell * mean, base.shape)
+        wind = jnp.broadcast_to(gust_factor * mean, base.shape)
         if self.lee is not None and start is not None:
             wind = wind * (1.0 - self.law.shelter * self.lee.shade(base, start, self.law.wind))
         if self.modes is not None:
             k, way, rate, phase = self.modes
-            # Eddies travel with the wind.
-            seen = base - clock.time * mean
-            angle = jnp.einsum("mc,vcb->vmb", k, seen, precision=jax.lax.Precision.HIGHEST)
+            # Eddies move with the wind.
+            moving_frame = base - clock.time * mean
+            angle = jnp.einsum("mc,vcb->vmb", k, moving_frame, precision=jax.lax.Precision.HIGHEST)
             angle = angle - (rate * clock.time - phase)[None, :, None]
             wind = wind + jnp.einsum(
                 "vmb,mc->vcb", jnp.cos(angle), way, precision=jax.lax.Precision.HIGHEST
@@ -190,5 +196,5 @@ class _Air(Prepared):
         u = velocity - wind
         across = jnp.sum(u * unit, axis=1, keepdims=True) * unit
         speed = jnp.sqrt(jnp.sum(u * u, axis=1, keepdims=True) + 1e-12)
-        slow = lambda c: 1.0 / (1.0 + h * self.load * c * speed)  # noqa: E731
-        return wind + slow(self.law.normal) * across + slow(self.law.tangent) * (u - across)
+        decay = lambda c: 1.0 / (1.0 + h * self.load * c * speed)  # noqa: E731
+        return wind + decay(self.law.normal) * across + decay(self.law.tangent) * (u - across)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Clock, Effect, Prepared
-from ._coloured import Sheaf, bundled, column, corner_pairs, sheaves, sweep
+from ._colored import ColorGroup, bundled, color_groups, column, corner_pairs, sweep
 from ._hinge import bending_hinges
 
 
@@ -21,7 +21,7 @@ class Bend(Effect):
 
     The coefficients ``c`` come from cotangents of the rest shape, so the energy is
     quadratic and its Hessian constant; see `bending_hinges` for its scale.
-    Cloth is flat at rest, also where it is worn round a sleeve.
+    Cloth is flat at rest, even where the garment is curved, as in a sleeve.
 
     References:
         Bergou, Wardetzky, Harmon, Zorin and Grinspun, A quadratic bending model for
@@ -33,7 +33,7 @@ class Bend(Effect):
         h = bending_hinges(assembly)
         quads, coefficients, k = h.corners, h.coefficient, h.stiffness
         w = np.asarray(inverse_mass)
-        order, parts = sheaves(quads, len(assembly.rest))
+        order, parts = color_groups(quads, len(assembly.rest))
         index, c = quads[order].astype(np.int32), coefficients[order]
         hinges = _Hinges(
             tuple(jnp.asarray(index[:, i]) for i in range(4)),
@@ -50,7 +50,7 @@ class Bend(Effect):
 class _Hinges:
     index: tuple[Int[Array, " members"], ...]
     coefficient: tuple[Float[Array, "members 1 1"], ...]
-    push: tuple[Float[Array, "members 1 1"], ...]
+    weighted_coefficient: tuple[Float[Array, "members 1 1"], ...]
     inertia: Float[Array, "members 1 1"]
     compliance: Float[Array, "members 1 1"]
 
@@ -61,7 +61,7 @@ class _Bend(Prepared):
     elastic = True
     materials = ("bend",)
     hinges: _Hinges
-    sheaves: tuple[Sheaf, ...]
+    color_groups: tuple[ColorGroup, ...]
 
     def rescaled(self, factors: Mapping[str, Any]) -> Prepared:
         if "bend" not in factors:
@@ -70,15 +70,15 @@ class _Bend(Prepared):
         softer = dataclasses.replace(h, compliance=h.compliance / factors["bend"])
         return dataclasses.replace(self, hinges=softer)
 
-    def begin(self, base: Array, start: None, end: None, clock: Clock, memory: Any) -> tuple:
+    def begin(self, base: Array, start: None, end: None, clock: Clock, state: Any) -> tuple:
         # The coefficients sum to zero: differences keep the sum exact far from the origin.
         h = self.hinges
         first = base[h.index[0]]
         flat = jnp.zeros_like(first)
         for c, i in zip(h.coefficient[1:], h.index[1:], strict=True):
             flat = flat + c * (base[i] - first)
-        known = (flat, h.coefficient, h.push, h.inertia, h.compliance)
-        return flat, bundled(self.sheaves, h.index, known)
+        known = (flat, h.coefficient, h.weighted_coefficient, h.inertia, h.compliance)
+        return flat, bundled(self.color_groups, h.index, known)
 
     def project(
         self,
@@ -91,11 +91,11 @@ class _Bend(Prepared):
         h = step[0]
 
         def move(rows: list[Array], known: tuple) -> list[Array]:
-            curvature, coefficient, push, inertia, compliance = known
+            curvature, coefficient, weighted_coefficient, inertia, compliance = known
             for c, row in zip(coefficient, rows, strict=True):
                 curvature = curvature + c * row
-            back = curvature / (inertia + compliance / (h * h))
-            return [row - p * back for p, row in zip(push, rows, strict=True)]
+            multiplier = curvature / (inertia + compliance / (h * h))
+            return [row - p * multiplier for p, row in zip(weighted_coefficient, rows, strict=True)]
 
         return sweep(displacement, context[1], move)
 

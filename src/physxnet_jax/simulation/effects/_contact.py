@@ -15,38 +15,37 @@ from ...errors import check_counts, check_numbers
 from ...geometry import closest_barycentric, spread_points, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Attached, Clock, Effect, Placed, Prepared
+from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints
 from ._limbs import LOWER_ARMS, TRUNK, UPPER_ARMS, limb_labels
 from ._pinch import ROOM, Pinch, prepare_pinch
 
 
 @dataclasses.dataclass(frozen=True)
 class BodyContact(Effect):
-    """Cloth keeps its thickness from the skin and rubs against it.
+    """Keeps cloth at its thickness from the skin, with Coulomb friction.
 
-    Once a block, each cloth vertex finds its closest skin point; within the block the
-    point and its normal move with the skin, and the half space beyond them is closed,
-    however fast the limb: nothing tunnels.
+    Once per contact interval, each cloth vertex finds its closest skin point. During the
+    interval the point and its normal move with the skin and bound a half-space that the
+    cloth can't enter at any speed of the limb: nothing tunnels.
 
     Cloth that lies on the skin *tracks* it: the search starts at the skin point of the
-    block before and walks over the surface, so the cloth may slide any distance but never
+    previous interval and walks over the surface. The cloth may slide any distance but never
     jumps to the far side of a limb, to another limb, or across a fold where the body
-    passes through itself. Between two limbs that come closer than twice its thickness,
-    tracking cloth keeps half of the room there is: where the body passes through itself
-    the cloth of both limbs lies midway, as if the flesh had given way, and is counted
-    (``pinched``). Hanging cloth compares a list of patches over all limbs within
-    reach instead.
+    intersects itself. Between two limbs closer than twice its thickness, tracking cloth keeps
+    half of the gap. Where the body intersects itself, the cloth of both limbs lies midway, as
+    if the flesh were compressed, and its vertices are counted (``pinched``). Loose cloth
+    doesn't track but compares a list of patches on all limbs within reach.
 
     Attributes:
-        patch: Triangles around the nearest skin vertex that are compared exactly.
-        ring: Skin vertices that a step of the walk chooses from.
-        hops: Steps of the walk a block; each reaches about two centimetres.
-        centres: Patches in the list of a hanging vertex.
-        spacing: Distance between them [m].
+        patch: Number of triangles around the nearest skin vertex that are compared exactly.
+        ring: Number of skin vertices that each step of the walk compares.
+        hops: Steps of the walk per contact interval; each covers about two centimetres.
+        centres: Number of patches in the list of a loose vertex.
+        spacing: Distance between these patches [m].
         push: Largest correction in one substep [m].
-        leave: Cloth that was lifted leaves the skin no faster than this [m/s]: what was
-            squeezed into a limb is set down outside instead of being shot away. Nor does
-            another limb press it onto its own faster.
+        leave: Maximum speed relative to the skin at which touching cloth leaves it [m/s]:
+            cloth squeezed into a limb moves out without being ejected. Also the maximum
+            speed at which another limb presses cloth onto its own limb.
 
     References:
         Macklin et al. (2016) for the projection; friction as a clamped tangential
@@ -67,7 +66,7 @@ class BodyContact(Effect):
         check_numbers(self, "leave", zero=True)
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Patches around skin vertices, and where each cloth vertex starts."""
+        """Builds patches around skin vertices and the first skin vertex of each search."""
         body = assembly.body
         skin = assembly.rest_body[:NUM_BODY_VERTICES]
         faces = np.asarray(triangulate(body.quads))
@@ -75,13 +74,13 @@ class BodyContact(Effect):
         label = _limbs(weights, body)
         loose = np.flatnonzero(assembly.loose)
         tight = np.flatnonzero(~assembly.loose)
-        # Only skin that cloth can get to takes part: far parts are not even skinned.
+        # Skin out of reach of the cloth is left out and not even posed.
         reach = KDTree(assembly.rest).query(skin, distance_upper_bound=_REACH)[0]
         used = np.flatnonzero(np.isfinite(reach))
         if len(used) < 3 * self.patch:
             used = np.arange(len(skin))
-        start = _start(assembly, skin, used, label, tight)
-        listed = _listed(assembly, skin, used, loose, self.spacing, self.centres)
+        start = _starting_vertices(assembly, skin, used, label, tight)
+        listed = _patch_centres(assembly, skin, used, loose, self.spacing, self.centres)
         kept = np.flatnonzero(np.isin(faces, used).all(axis=1))
         size = min(self.patch, len(kept))
         far, near = KDTree(skin[faces[kept]].mean(axis=1)).query(skin[used], k=size)
@@ -90,12 +89,12 @@ class BodyContact(Effect):
         local = np.zeros(len(skin), dtype=np.int32)
         local[used] = np.arange(len(used))
         normals = vertex_normals(float32(skin), jnp.asarray(faces))
-        attached = Attached(
+        skinned_points = SkinnedPoints(
             float32(skin[used]), normals[jnp.asarray(used)], body.weights[jnp.asarray(used)]
         )
         w = np.asarray(inverse_mass)
         return _Contact(
-            attached,
+            skinned_points,
             jnp.asarray(ring.reshape(len(used), -1).astype(np.int32)),
             jnp.asarray(near.T.astype(np.int32)),
             jnp.asarray(np.moveaxis(local[faces[kept]][near], 0, 2)),
@@ -109,7 +108,7 @@ class BodyContact(Effect):
             float32(assembly.thickness[:, None]),
             float32(assembly.friction[:, None]),
             float32((w > 0)[:, None]),
-            prepare_pinch(skin[used], np.asarray(attached.normals), weights[used], body),
+            prepare_pinch(skin[used], np.asarray(skinned_points.normals), weights[used], body),
             jnp.asarray(assembly.loose[:, None]),
             self.push,
             self.leave,
@@ -117,36 +116,36 @@ class BodyContact(Effect):
         )
 
 
-# Room where nothing limits it [m].
+# Gap that counts as unlimited [m].
 _FREE = 10.0
-# Above the middle of a pinch, so that skin beside it stays covered [m].
+# Offset above the middle of a pinch, so that skin beside it stays covered [m].
 _COVER = 0.002
-# Cloth this little above its thickness touches the skin [m].
+# Cloth closer than this to its minimum height touches the skin [m].
 _NEAR = 0.001
-# Skin farther than this from all cloth at rest takes no part [m].
+# Skin farther than this from all cloth at rest is left out [m].
 _REACH = 0.30
 
 
-def _start(
+def _starting_vertices(
     assembly: Assembly,
     skin: Float[np.ndarray, "body 3"],
     used: Int[np.ndarray, " used"],
     label: Int[np.ndarray, " body"],
     rows: Int[np.ndarray, " tight"],
 ) -> Int[np.ndarray, " tight"]:
-    """The skin vertex nearest to each cloth vertex at rest, on its own limb."""
+    """The nearest skin vertex of the same limb for each cloth vertex at rest."""
     cloth = _limbs(assembly.weights, assembly.body)[rows]
     out = np.zeros(len(rows), dtype=np.int64)
     for lab in np.unique(cloth):
-        mine = cloth == lab
-        # Arms and legs keep to themselves; the trunk's cloth may start anywhere.
+        selected = cloth == lab
+        # Cloth of a limb starts on that limb or the trunk, cloth of the trunk anywhere.
         pool = used if lab == TRUNK else used[(label[used] == lab) | (label[used] == TRUNK)]
         pool = pool if len(pool) else used
-        out[mine] = pool[KDTree(skin[pool]).query(assembly.rest[rows[mine]])[1]]
+        out[selected] = pool[KDTree(skin[pool]).query(assembly.rest[rows[selected]])[1]]
     return out
 
 
-def _listed(
+def _patch_centres(
     assembly: Assembly,
     skin: Float[np.ndarray, "body 3"],
     used: Int[np.ndarray, " used"],
@@ -154,14 +153,14 @@ def _listed(
     spacing: float,
     count: int,
 ) -> Int[np.ndarray, "loose k"]:
-    """Skin vertices whose patches a hanging vertex compares."""
+    """Skin vertices whose patches each loose vertex compares."""
     pool = used[spread_points(skin[used], spacing)]
     k = min(count, len(pool))
     return pool[KDTree(skin[pool]).query(assembly.rest[rows], k=k)[1].reshape(len(rows), k)]
 
 
 def _limbs(weights: Float[np.ndarray, "points joints"], body: Body) -> Int[np.ndarray, " points"]:
-    """Limbs between which a tight garment doesn't slide; an arm is one."""
+    """Limb labels, between which tight garments don't slide; each arm is one limb."""
     label = limb_labels(weights, body)
     for upper, lower in zip(UPPER_ARMS, LOWER_ARMS, strict=True):
         label[label == lower] = upper
@@ -171,22 +170,22 @@ def _limbs(weights: Float[np.ndarray, "points joints"], body: Body) -> Int[np.nd
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Touch:
-    """Where each cloth vertex meets the skin in a block.
+    """Contacts of all cloth vertices with the skin in a contact interval.
 
     Attributes:
-        where: From the cloth to its skin point at the start [m].
-        way: How that point moves in the block [m].
-        normal: The skin's normal there at the start, not unit.
-        turn: How it changes in the block.
-        centre: Skin vertices to start from in the next block.
-        room: Of the skin at the end, see `Pinch.room`.
-        missed: The point lies beyond its patch.
-        unit: The normal at the start, unit.
-        ceiling: Fastest that touching cloth may leave [m/s].
-        height: Wanted above the skin at the start [m].
-        rise: How that changes in the block [m].
-        top: Allowed above the skin at the start [m]: the other limb is beyond.
-        fall: How that changes in the block [m].
+        where: Vector from the cloth vertex to its skin point at the start [m].
+        way: Motion of the skin point during the interval [m].
+        normal: Skin normal at the start, not normalised.
+        turn: Change of the normal during the interval.
+        centre: Skin vertices at which the next search starts.
+        room: Gap at each skin vertex at the end, see `Pinch.room`.
+        missed: Whether the closest point may lie beyond the patch.
+        unit: Unit normal at the start.
+        ceiling: Maximum outward speed of touching cloth [m/s].
+        height: Minimum height above the skin at the start [m].
+        rise: Change of the minimum height during the interval [m].
+        top: Maximum height above the skin at the start, due to another limb [m].
+        fall: Change of the maximum height during the interval [m].
     """
 
     where: Float[Array, "vertices 3 batch"]
@@ -207,7 +206,7 @@ class _Touch:
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Contact(Prepared):
-    skin: Attached
+    skin: SkinnedPoints
     ring: Int[Array, "skin ring"]
     table: Int[Array, "patch skin"]
     corners: Int[Array, "patch 3 skin"]
@@ -228,7 +227,7 @@ class _Contact(Prepared):
     hops: int = dataclasses.field(metadata={"static": True})
 
     @property
-    def attached(self) -> Attached:
+    def skinned_points(self) -> SkinnedPoints:
         return self.skin
 
     materials = ("friction",)
@@ -238,11 +237,11 @@ class _Contact(Prepared):
             return self
         return dataclasses.replace(self, friction=self.friction * factors["friction"])
 
-    def initial(self, batch: int) -> tuple[Array, Array]:
+    def init_state(self, batch: int) -> tuple[Array, Array]:
         room = jnp.full((self.skin.rest.shape[0], batch), ROOM, self.skin.rest.dtype)
         return jnp.repeat(self.start[:, None], batch, axis=1), room
 
-    def keep(self, context: _Touch) -> tuple[Array, Array]:
+    def update_state(self, context: _Touch) -> tuple[Array, Array]:
         return context.centre, context.room
 
     def walk(
@@ -251,7 +250,7 @@ class _Contact(Prepared):
         skin: Float[Array, "skin 3 batch"],
         at: Int[Array, "some batch"],
     ) -> Int[Array, "some batch"]:
-        """Over the surface to a skin vertex that has none nearer in its ring."""
+        """Moves ``hops`` times to the nearest skin vertex of the current vertex's ring."""
         lane = jnp.arange(points.shape[2])[None, :, None]
         p = jnp.moveaxis(points, 1, 2)[:, :, None]
 
@@ -271,7 +270,7 @@ class _Contact(Prepared):
     ) -> tuple[Array, Array]:
         """Face and barycentric weights [3, some, batch] of the closest point on a patch."""
         batch = points.shape[2]
-        # [patch, 3, some, batch], flat so that every gather is one of single numbers.
+        # [patch, 3, some, batch], flattened so that each gather reads scalars.
         corner = (
             self.corners[:, :, centre] * batch
             + jnp.arange(batch, dtype=jnp.int32)[None, None, None]
@@ -288,14 +287,14 @@ class _Contact(Prepared):
     def begin(
         self,
         base: Array,
-        start: Placed,
-        end: Placed,
+        start: PosedPoints,
+        end: PosedPoints,
         clock: Clock,
-        memory: tuple[Array, Array],
+        state: tuple[Array, Array],
     ) -> _Touch:
         stop = jax.lax.stop_gradient
         points = stop(start.points)
-        centre, room = memory
+        centre, room = state
         centre = self.walk(stop(base[self.tight]), points, centre)
         last = centre
         if self.loose.shape[0]:
@@ -309,12 +308,12 @@ class _Contact(Prepared):
         p0, n0 = _surface(start, self.faces, face, weights)
         p1, n1 = _surface(end, self.faces, face, weights)
         lane = jnp.arange(base.shape[2])[None]
-        from_middle = p0 - jnp.moveaxis(start.points[last, :, lane], -1, 1)
-        far = jnp.sum(from_middle**2, axis=1) > self.radius[last] ** 2
+        from_centre = p0 - jnp.moveaxis(start.points[last, :, lane], -1, 1)
+        far = jnp.sum(from_centre**2, axis=1) > self.radius[last] ** 2
         unit = n0 / jnp.sqrt(jnp.sum(n0 * n0, axis=1, keepdims=True) + 1e-12)
         later = self.pinch.room(end)
-        wanted, top = self._between(room, face, weights)
-        rise, fall = self._between(later, face, weights)
+        wanted, top = self._height_bounds(room, face, weights)
+        rise, fall = self._height_bounds(later, face, weights)
         height = jnp.sum((base - p0) * unit, axis=1, keepdims=True)
         touching = height < wanted + _NEAR
         fastest = jnp.sum((p1 - p0) * unit, axis=1, keepdims=True) / clock.length + self.leave
@@ -322,18 +321,18 @@ class _Contact(Prepared):
         heights = wanted, rise - wanted, top, fall - top
         return _Touch(p0 - base, p1 - p0, n0, n1 - n0, centre, later, far, unit, ceiling, *heights)
 
-    def _between(self, room: Array, face: Array, weights: Array) -> tuple[Array, Array]:
-        """Least and largest height above the skin [m], the same where limbs leave no room."""
+    def _height_bounds(self, room: Array, face: Array, weights: Array) -> tuple[Array, Array]:
+        """Minimum and maximum height above the skin [m], equal where limbs leave no gap."""
         lane = jnp.arange(room.shape[1])[None]
         tri = self.faces[face]
         there = jnp.sum(
             jnp.stack([weights[k] * room[tri[..., k], lane] for k in range(3)]), axis=0
         )[:, None]
-        # Grows without bound, and smoothly, towards what counts as no pinch.
+        # Grows smoothly to `_FREE` as the gap approaches `ROOM`, beyond which there is no pinch.
         there = there / jnp.maximum(1.0 - (jnp.maximum(there, 0.0) / ROOM) ** 2, ROOM / _FREE)
         there = jnp.where(self.hanging[..., None], _FREE, there)
         thickness = self.thickness[..., None]
-        # Layers keep their order both ways: the outermost lies in the middle.
+        # Layers keep their order on both limbs: the outermost lies in the middle.
         outermost = self.thickness.max()
         under = outermost - thickness
         low = jnp.minimum(thickness, 0.5 * there + _COVER - under)
@@ -357,11 +356,11 @@ class _Contact(Prepared):
         high = context.top + progress * context.fall
         slowest = -self.leave * step[0]
         lift = jnp.clip(jnp.clip(height, low, high) - height, slowest, self.push)
-        # Where nothing limits the height nothing holds what is above it.
+        # Without a maximum height, cloth above the skin is free.
         lift = jnp.where(high > 0.9 * _FREE, jnp.maximum(lift, 0.0), lift)
         lift = lift * self.free[..., None]
         moved = displacement + lift * n
-        # Friction acts against the skin's own way in this substep.
+        # Friction opposes the motion relative to the skin in this substep.
         slide = (moved - start) - step[1] * context.way
         slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
         length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
@@ -377,19 +376,19 @@ class _Contact(Prepared):
 
     def diagnose(self, displacement: Array, context: _Touch) -> dict[str, Array]:
         height = self._height(displacement, context, jnp.ones((), displacement.dtype))[1]
-        # Below the skin; in a pinch, a thickness below its middle.
+        # Depth below the skin or, in a pinch, below a thickness under its middle.
         wanted = context.height + context.rise
         inside = (wanted - self.thickness[..., None] - height)[:, 0]
         return {
             "penetration_max": jnp.maximum(inside.max(axis=0), 0.0),
             "inside_share": jnp.mean((inside > 0).astype(displacement.dtype), axis=0),
-            # Far from the skin it doesn't matter which point is the closest.
+            # Far from the skin the choice of the closest point doesn't matter.
             "missed": jnp.sum(context.missed & (inside > -0.02), axis=0),
             "pinched": jnp.sum(wanted[:, 0] < 0, axis=0),
         }
 
 
-def _surface(skin: Placed, faces: Array, face: Array, weights: Array) -> tuple[Array, Array]:
+def _surface(skin: PosedPoints, faces: Array, face: Array, weights: Array) -> tuple[Array, Array]:
     """Points and smooth normals of the skin, shape [vertices, 3, batch]."""
     lane = jnp.arange(skin.points.shape[2])[None]
     tri = faces[face]

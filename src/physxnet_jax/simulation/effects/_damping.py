@@ -1,4 +1,4 @@
-"""Damping: velocities decay in the air."""
+"""Damping: exponential decay of velocities."""
 
 import dataclasses
 import math
@@ -16,9 +16,9 @@ class Damping(Effect):
     """``dv/dt = -rate v``, integrated exactly.
 
     Attributes:
-        rate: Decay [1/s]. One per second is what still air does to light cotton that
-            moves at 1 m/s (drag 0.5 rho c v with c about 1 over 0.15 kg/m^2, seen
-            from the average direction).
+        rate: Decay rate [1/s]. One per second corresponds to light cotton that moves at
+            1 m/s in still air (drag 0.5 rho c v with c about 1 over 0.15 kg/m^2, averaged
+            over directions).
     """
 
     rate: float = 1.0

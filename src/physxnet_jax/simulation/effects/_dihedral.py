@@ -11,7 +11,7 @@ from jaxtyping import Array
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
-from ._coloured import Coloured, Constraint, Group, colour_group
+from ._colored import Colored, Constraint, Group, color_constraints
 from ._hinge import bending_hinges
 
 
@@ -19,8 +19,8 @@ from ._hinge import bending_hinges
 class Dihedral(Effect):
     """``E = 1/2 sum k |e|^2 / (A_1 + A_2) theta^2`` over interior edges.
 
-    ``theta`` is the signed angle between the normals, flat at rest. Unlike `Bend` it
-    stays right when the cloth stretches or folds back; see `bending_hinges` for its
+    ``theta`` is the signed angle between the normals, zero at rest. Unlike `Bend` it
+    stays correct when the cloth stretches or folds back; see `bending_hinges` for its
     scale.
 
     References:
@@ -32,12 +32,12 @@ class Dihedral(Effect):
         """Colours the hinges so that a Gauss-Seidel sweep runs colour by colour."""
         h = bending_hinges(assembly)
         law = {"compliance": 1.0 / np.maximum(h.stiffness * h.length**2, 1e-12)}
-        return _Dihedral(colour_group(h.corners, np.asarray(inverse_mass), law))
+        return _Dihedral(color_constraints(h.corners, np.asarray(inverse_mass), law))
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _Dihedral(Coloured):
+class _Dihedral(Colored):
     group: Group
 
     materials = ("bend",)
@@ -55,7 +55,7 @@ class _Dihedral(Coloured):
             e = b - a
             length = _norm(e)
             left, right = jnp.cross(e, p - a, axis=1), jnp.cross(q - a, e, axis=1)
-            # A triangle without area has no normal: it counts as a sliver.
+            # A triangle without area has no normal: it is treated as a sliver.
             sl = jnp.maximum(jnp.sum(left * left, axis=1, keepdims=True), 1e-16)
             sr = jnp.maximum(jnp.sum(right * right, axis=1, keepdims=True), 1e-16)
             n, m = left / jnp.sqrt(sl), right / jnp.sqrt(sr)

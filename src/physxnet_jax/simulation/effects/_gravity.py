@@ -25,7 +25,7 @@ class Gravity(Effect):
             raise ValueError(f"g is {self.g}, expected a finite number")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Pinned vertices fall too; their pins put them back."""
+        """Acts on pinned vertices too; `Pin` resets them."""
         return _Gravity(self.g)
 
 

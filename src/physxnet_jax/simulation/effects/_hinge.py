@@ -1,4 +1,4 @@
-"""Hinges: stencils over two triangles, and what they make of a curvature."""
+"""Hinges: bending stencils over two triangles that share an edge."""
 
 import dataclasses
 
@@ -8,20 +8,20 @@ from jaxtyping import Float, Int
 from ...geometry import hinges
 from .._assembly import Assembly
 
-# Triangles flatter than this share of their longest edge squared bend nothing.
+# Triangles whose doubled area is below this share of the longest edge squared are left out.
 _SLIVER = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Hinges:
-    """Interior edges with sound triangles on both sides.
+    """Interior edges with non-degenerate triangles on both sides.
 
     Attributes:
         corners: Ends a, b and the opposite corners left and right, shape [hinges, 4].
-        coefficient: Of the quadratic bending energy, shape [hinges, 4].
-        area: Of both triangles [m^2], shape [hinges].
-        length: Of the edge [m], shape [hinges].
-        stiffness: Of ``|sum c x|^2 / 2`` [N/m], shape [hinges].
+        coefficient: Coefficients of the quadratic bending energy, shape [hinges, 4].
+        area: Total area of both triangles [m^2], shape [hinges].
+        length: Length of the edge [m], shape [hinges].
+        stiffness: Factor of ``|sum c x|^2 / 2`` [N/m], shape [hinges].
     """
 
     corners: Int[np.ndarray, "hinges 4"]
@@ -44,25 +44,25 @@ def bending_hinges(assembly: Assembly) -> Hinges:
 
     With ``3 / A``, which makes the quadratic form a Laplacian of edge midpoints (Bergou et al.
     2006), strips sag only 0.4 times as far as a beam of the same stiffness. With ``1 / A``
-    cylinders about an axis of a grid store ``k kappa^2 / 2`` an area within 3 %, and strips
-    clamped at one end sag 1.1 to 1.3 times as far as beams, whichever way the mesh is cut:
-    farthest on right-angled grids (tested). Fitting weights hinge by hinge to cylinders of all
-    directions made them sag farther still: some hinges nearly vanish.
+    cylinders about a grid axis store ``k kappa^2 / 2`` per area within 3 %. Strips clamped at
+    one end sag 1.1 to 1.3 times as far as beams on all triangulations, farthest on right-angled
+    grids (tested). With weights fitted hinge by hinge to cylinders of all directions they sag
+    even farther, as some hinges nearly vanish.
     """
     x = assembly.rest
-    every = hinges(assembly.faces[sound(x, assembly.faces)])
-    coefficient, area = hinge_stencils(x, every)
-    length = np.linalg.norm(x[every[:, 1]] - x[every[:, 0]], axis=1)
-    of_vertex = np.zeros(len(x))
-    of_vertex[assembly.faces] = assembly.bend[:, None]
-    k = of_vertex[every[:, 0]] / area
-    return Hinges(every, coefficient, area, length, k)
+    interior = hinges(assembly.faces[sound(x, assembly.faces)])
+    coefficient, area = hinge_stencils(x, interior)
+    length = np.linalg.norm(x[interior[:, 1]] - x[interior[:, 0]], axis=1)
+    vertex_bend = np.zeros(len(x))
+    vertex_bend[assembly.faces] = assembly.bend[:, None]
+    k = vertex_bend[interior[:, 0]] / area
+    return Hinges(interior, coefficient, area, length, k)
 
 
 def hinge_stencils(
     x: Float[np.ndarray, "vertices 3"], quads: Int[np.ndarray, "hinges 4"]
 ) -> tuple[Float[np.ndarray, "hinges 4"], Float[np.ndarray, " hinges"]]:
-    """Coefficients of (a, b, left, right) and the area of both triangles."""
+    """Coefficients of (a, b, left, right) and the total area of both triangles."""
     a, b, p, q = (x[quads[:, i]] for i in range(4))
 
     def cot(u: np.ndarray, v: np.ndarray) -> np.ndarray:

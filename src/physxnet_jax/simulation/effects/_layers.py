@@ -1,4 +1,4 @@
-"""Contact between garments worn in layers, in a stated order."""
+"""Contact between garments in layers, in the order of the scene."""
 
 import dataclasses
 
@@ -17,38 +17,38 @@ from .._effect import Clock, Effect, Prepared
 from ._limbs import adjoining, limb_labels
 from ._pairs import ClothContact, Facing, Pairs, closest_of, foot_of, rows_of, side_normal
 
-# Layers farther apart than this at rest never meet [m].
+# Vertices farther than this from the other garment at rest never touch it [m].
 _REACH = 0.25
-# A vertex deeper than this under its layer has lost its place there [m].
-_LOST = 0.05
-# Up to this depth a vertex on the wrong side is told of [m].
-_WATCHED = 0.25
-# Beyond the border of the other garment by more than this there is nothing to touch [m].
-_BESIDE = 0.002
+# Vertices deeper than this on the wrong side aren't corrected [m].
+_MAX_CORRECTED = 0.05
+# Vertices on the wrong side are reported up to this depth [m].
+_MAX_REPORTED = 0.25
+# Vertices farther than this beyond the border of the other garment don't touch it [m].
+_BORDER_TOLERANCE = 0.002
 
 
 @dataclasses.dataclass(frozen=True)
 class LayerContact(Effect):
-    """Each garment of a scene is worn over the ones before it, and stays there.
+    """Keeps each garment of a scene over the ones before it.
 
-    Every vertex tracks the closest point of the other garment as `BodyContact` tracks
-    the skin: the search starts where it ended and walks over the surface. The order is
-    known, so a vertex on the wrong side is brought back instead of being kept there.
-    Both ways count: vertices of the outer garment against triangles of the inner one,
-    and vertices of the inner one against triangles of the outer one.
+    Each vertex tracks the closest point of the other garment as `BodyContact` tracks the
+    skin: the search starts at the previous result and walks over the surface. The order
+    is known, so a vertex on the wrong side is moved back instead of being kept there.
+    Vertices of the outer garment are tested against triangles of the inner one, and
+    vertices of the inner one against triangles of the outer one.
 
     Attributes:
         gap: Distance kept between layers [m].
         friction: Coulomb coefficient between them [1].
-        leave: Layers that overlap are parted at this speed [m/s].
-        hops: Steps of the walk a block.
-        ring: Vertices that a step chooses from.
-        patch: Triangles around the nearest vertex that are compared exactly.
+        leave: Speed at which overlapping layers separate [m/s].
+        hops: Steps of the walk per contact interval.
+        ring: Number of vertices that each step compares.
+        patch: Number of triangles around the nearest vertex that are compared exactly.
 
     References:
         Bridson, Fedkiw and Anderson, Robust treatment of collisions, contact and
-        friction for cloth animation (2002), for vertex against triangle; the order of
-        layers instead of their history is ours.
+        friction for cloth animation (2002), for vertex against triangle. That the order
+        of layers replaces their history is specific to this package.
     """
 
     gap: float = 0.003
@@ -63,7 +63,7 @@ class LayerContact(Effect):
         check_counts(self, "hops", "ring", "patch")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Tables of each garment's surface, and where each vertex starts on the others."""
+        """Builds tables of each garment's surface and the first vertex of each search."""
         x, parts = assembly.rest, assembly.parts
         label = limb_labels(assembly.weights, assembly.body)
         ring = np.zeros((len(x), self.ring), np.int32)
@@ -78,7 +78,7 @@ class LayerContact(Effect):
             patch[i:j] = own[_nearest(x[f].mean(axis=1), x[i:j], self.patch)]
             edges = mesh_edges(f)
             rim[edges.vertices[edges.count == 1]] = 1.0
-            # Which way a garment's triangles face: away from the skin is outwards.
+            # Orientation of the garment's triangles: outwards is away from the skin.
             n = np.cross(x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]])
             middle = x[f].mean(axis=1)
             away = middle - skin[KDTree(skin).query(middle)[1]]
@@ -88,13 +88,13 @@ class LayerContact(Effect):
             for b in range(len(parts) - 1):
                 if a == b:
                     continue
-                mine = np.arange(parts[a], parts[a + 1])
-                near = parts[b] + _nearest(x[parts[b] : parts[b + 1]], x[mine], 1)[:, 0]
-                meet = np.linalg.norm(x[near] - x[mine], axis=1) < _REACH
-                mine, near = mine[meet], near[meet]
-                rows.append(mine)
+                own_vertices = np.arange(parts[a], parts[a + 1])
+                near = parts[b] + _nearest(x[parts[b] : parts[b + 1]], x[own_vertices], 1)[:, 0]
+                in_reach = np.linalg.norm(x[near] - x[own_vertices], axis=1) < _REACH
+                own_vertices, near = own_vertices[in_reach], near[in_reach]
+                rows.append(own_vertices)
                 start.append(near)
-                side.append(np.full(len(mine), outwards[b] * (1.0 if a > b else -1.0)))
+                side.append(np.full(len(own_vertices), outwards[b] * (1.0 if a > b else -1.0)))
         if not rows:
             rows, start, side = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
         return _Layers(
@@ -115,7 +115,7 @@ class LayerContact(Effect):
 def _nearest(
     of: Float[np.ndarray, "many 3"], to: Float[np.ndarray, "points 3"], count: int
 ) -> Int[np.ndarray, "points count"]:
-    """The nearest of some points; the last repeated where there are too few."""
+    """Indices of the nearest points, with the last one repeated if there are too few."""
     k = min(count, len(of))
     found = np.reshape(KDTree(of).query(to, k=k)[1], (len(to), k))
     return np.pad(found, ((0, 0), (0, count - k)), mode="edge")
@@ -136,13 +136,13 @@ class _Layers(ClothContact):
     inverse_mass: Float[Array, "vertices 1 1"]
     law: LayerContact = dataclasses.field(metadata={"static": True})
 
-    def initial(self, batch: int) -> Int[Array, "pairs batch"]:
+    def init_state(self, batch: int) -> Int[Array, "pairs batch"]:
         return jnp.repeat(self.start[:, None], batch, axis=1)
 
-    def begin(self, base: Array, start: None, end: None, clock: Clock, memory: Array) -> Facing:
+    def begin(self, base: Array, start: None, end: None, clock: Clock, state: Array) -> Facing:
         x = jax.lax.stop_gradient(base)
         points = x[self.rows]
-        at = memory
+        at = state
         for _ in range(self.law.hops):
             ring = self.ring[at]
             gap = rows_of(x, jnp.moveaxis(ring, 2, 1)) - points[:, None]
@@ -151,19 +151,19 @@ class _Layers(ClothContact):
         corners, weights = closest_of(x, points, self.faces[self.patch[at]])
         foot = foot_of(x, corners, weights)
         n = self.side * side_normal(x, corners)
-        apart = points - foot
-        height = jnp.sum(apart * n, axis=1, keepdims=True)
-        beside = apart - height * n
+        offset = points - foot
+        height = jnp.sum(offset * n, axis=1, keepdims=True)
+        beside = offset - height * n
         edge = jnp.sum(weights * (1.0 - self.rim[corners]), axis=0)[:, None] < 1e-3
-        past = edge & (jnp.sum(beside * beside, axis=1, keepdims=True) > _BESIDE**2)
+        past = edge & (jnp.sum(beside * beside, axis=1, keepdims=True) > _BORDER_TOLERANCE**2)
         close = self.adjoining[self.label[self.rows][:, None], self.label[at]][:, None]
         over = close & ~past
-        active = over & (height > -_LOST)
+        active = over & (height > -_MAX_CORRECTED)
         vertex = jnp.repeat(self.rows[:, None], base.shape[2], axis=1)
-        # Against the true positions, so that the height has a derivative.
+        # From positions without `stop_gradient`, so that the height has a derivative.
         height = jnp.sum((base[self.rows] - foot_of(base, corners, weights)) * n, axis=1)[:, None]
         pairs = Pairs(vertex, corners, weights, n, height, active.astype(base.dtype))
-        watched = (over & (height > -_WATCHED)).astype(base.dtype)
+        watched = (over & (height > -_MAX_REPORTED)).astype(base.dtype)
         return Facing(pairs, clock, at, watched)
 
     def diagnose(self, displacement: Array, context: Facing) -> dict[str, Array]:

@@ -12,7 +12,7 @@ from ...errors import check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
-from ._coloured import Coloured, Constraint, Group, colour_group, directed
+from ._colored import Colored, Constraint, Group, color_constraints, directed
 from ._hinge import sound
 
 
@@ -20,13 +20,12 @@ from ._hinge import sound
 class Membrane(Effect):
     """``E = 1/2 sum A (Y_u (|w_u|-1)^2 + Y_v (|w_v|-1)^2 + G s^2)`` over triangles.
 
-    ``w_u`` and ``w_v`` are the images of the warp and weft directions, ``s`` their
+    ``w_u`` and ``w_v`` are the images of the warp and weft directions. ``s`` is their
     inner product over their lengths, the sine of the shear angle. Unlike springs along
-    edges (`Stretch`), the three stiffnesses don't depend on how the mesh is cut.
+    edges (`Stretch`), the three stiffnesses don't depend on the triangulation.
 
     Attributes:
-        compression: Stiffness against shortening as a share of that against
-            lengthening.
+        compression: Stiffness in compression relative to that in tension [1].
 
     References:
         Baraff and Witkin, Large steps in cloth simulation (1998), section 4.2 (shear
@@ -39,7 +38,7 @@ class Membrane(Effect):
         check_numbers(self, "compression")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Colours the triangles; slivers are left out."""
+        """Colours the triangles, except slivers."""
         faces, area, inverse = rest_frames(assembly)
         usable = sound(assembly.rest, faces)
         a = area[usable]
@@ -53,17 +52,17 @@ class Membrane(Effect):
             "weft": 1.0 / np.maximum(a * fabric[:, 1], 1e-9),
             "shear": 1.0 / np.maximum(a * fabric[:, 2], 1e-9),
         }
-        group = colour_group(faces[usable], np.asarray(inverse_mass), law)
+        group = color_constraints(faces[usable], np.asarray(inverse_mass), law)
         return _Membrane(group, 1.0 / self.compression)
 
 
 def rest_frames(
     assembly: Assembly,
 ) -> tuple[Int[np.ndarray, "faces 3"], Float[np.ndarray, " faces"], Float[np.ndarray, "faces 2 2"]]:
-    """Faces, their areas [m^2] and the inverse of their edges in warp and weft [1/m].
+    """Faces, their areas [m^2] and inverse edge matrices in warp and weft axes [1/m].
 
-    The warp runs down the garment: the projection of the vertical at rest, or of the
-    depth where a triangle lies level.
+    The warp is the projection of the vertical axis at rest, or of the depth axis for
+    level triangles.
     """
     x, f = assembly.rest, assembly.faces
     e1, e2 = x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]]
@@ -91,7 +90,7 @@ def rest_frames(
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _Membrane(Coloured):
+class _Membrane(Colored):
     group: Group
     softer: float = dataclasses.field(metadata={"static": True})
     materials = ("stretch",)
@@ -118,7 +117,7 @@ class _Membrane(Coloured):
         def shear(x: tuple[Array, ...]) -> Constraint:
             u1, u2, v1, v2 = law["u1"], law["u2"], law["v1"], law["v2"]
             u, v = u1 * x[1] + u2 * x[2], v1 * x[1] + v2 * x[2]
-            # A collapsed direction has no angle: below a tenth it counts as a tenth.
+            # A collapsed direction has no angle: lengths below a tenth count as a tenth.
             lu = jnp.sqrt(jnp.maximum(jnp.sum(u * u, axis=1, keepdims=True), 1e-2))
             lv = jnp.sqrt(jnp.maximum(jnp.sum(v * v, axis=1, keepdims=True), 1e-2))
             u, v = u / lu, v / lv
@@ -130,7 +129,7 @@ class _Membrane(Coloured):
         return [direction("u1", "u2", "warp"), direction("v1", "v2", "weft"), shear]
 
     def hessian(self, displacement: Array, context: tuple) -> Array | None:
-        """Gauss-Newton, and across each taut direction what its tension adds."""
+        """Gauss-Newton blocks, plus the effect of tension across each taut direction."""
         blocks = super().hessian(displacement, context)
         if blocks is None:
             return None

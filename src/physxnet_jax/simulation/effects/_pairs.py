@@ -1,4 +1,4 @@
-"""Cloth against cloth: vertices that face triangles, kept apart and rubbing."""
+"""Contact of cloth with cloth: separation and friction of vertices and triangles."""
 
 import dataclasses
 from typing import Any, Protocol, runtime_checkable
@@ -14,15 +14,15 @@ from .._effect import Clock, Prepared
 @pytree
 @dataclasses.dataclass(frozen=True)
 class Pairs:
-    """Vertices, each with the closest point of a triangle: what a block knows of them.
+    """Vertices and the closest points of triangles, for one contact interval.
 
     Attributes:
         vertex: Rows of the vertices, shape [pairs, batch].
         corners: Rows of the triangles' corners, shape [3, pairs, batch].
         weights: Barycentric weights of the closest points, shape [3, pairs, batch].
-        normal: Directions in which the vertices are pushed, shape [pairs, 3, batch].
-        height: Along them, at the block's start [m], shape [pairs, 1, batch].
-        active: 1 where the pair counts, else 0, shape [pairs, 1, batch].
+        normal: Directions in which the vertices are moved, shape [pairs, 3, batch].
+        height: Heights along the normals at the start [m], shape [pairs, 1, batch].
+        active: 1 for active pairs, else 0, shape [pairs, 1, batch].
     """
 
     vertex: Int[Array, "pairs batch"]
@@ -33,41 +33,41 @@ class Pairs:
     active: Float[Array, "pairs 1 batch"]
 
     def members(self) -> tuple[list[Array], list[Array]]:
-        """Rows of the vertex and the three corners, and their shares in the distance."""
+        """Rows of the vertex and the three corners, and their coefficients in the distance."""
         shares = [jnp.ones_like(self.weights[0]), *(-self.weights)]
         return [self.vertex, *self.corners], shares
 
-    def parted(self, displacement: Float[Array, "vertices 3 batch"]) -> Array:
-        """How vertices have moved against their points [m], shape [pairs, 3, batch]."""
+    def motion(self, displacement: Float[Array, "vertices 3 batch"]) -> Array:
+        """Displacements of vertices relative to their points [m], shape [pairs, 3, batch]."""
         index, share = self.members()
         return sum(s[:, None] * rows_of(displacement, i) for i, s in zip(index, share, strict=True))  # pyright: ignore[reportReturnType]
 
     def heights(self, displacement: Float[Array, "vertices 3 batch"]) -> Array:
-        """Heights after these displacements [m], shape [pairs, 1, batch]."""
-        return self.height + jnp.sum(self.parted(displacement) * self.normal, axis=1, keepdims=True)
+        """Heights after the displacements [m], shape [pairs, 1, batch]."""
+        return self.height + jnp.sum(self.motion(displacement) * self.normal, axis=1, keepdims=True)
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class Facing:
-    """What cloth contact knows in a block.
+    """Context of cloth contact in a contact interval.
 
     Attributes:
-        pairs: Who faces whom.
-        clock: The block.
-        kept: For the next block.
-        watched: 1 where the pair is looked at, whether it acts or not; None for ``active``.
+        pairs: Vertices and the triangles that they face.
+        clock: Start and length of the interval.
+        state: Effect state for the next interval.
+        watched: 1 for pairs in the diagnostics, active or not; if None, those are ``active``.
     """
 
     pairs: Pairs
     clock: Clock
-    kept: Any
+    state: Any
     watched: Float[Array, "pairs 1 batch"] | None = None
 
 
 @runtime_checkable
 class Spacing(Protocol):
-    """How far cloth keeps from cloth: gap [m], friction [1], speed of recovery [m/s]."""
+    """Settings of cloth contact: gap [m], friction [1], speed of separation [m/s]."""
 
     @property
     def gap(self) -> float: ...
@@ -78,13 +78,13 @@ class Spacing(Protocol):
 
 
 class ClothContact(Prepared):
-    """What contact of cloth with cloth shares: say in `begin` who faces whom."""
+    """Base class of contact of cloth with cloth; `begin` of subclasses finds the pairs."""
 
     inverse_mass: Float[Array, "vertices 1 1"]
     law: Spacing
 
-    def keep(self, context: Facing) -> Any:
-        return context.kept
+    def update_state(self, context: Facing) -> Any:
+        return context.state
 
     def project(
         self,
@@ -94,7 +94,7 @@ class ClothContact(Prepared):
         progress: Array,
         step: tuple[float, float],
     ) -> Array:
-        return keep_apart(
+        return separate_pairs(
             displacement, start, context.pairs, self.inverse_mass, self.law, context.clock, progress
         )
 
@@ -113,7 +113,7 @@ def closest_of(
 ) -> tuple[Array, Array]:
     """The closest of k triangles for each point: corners and weights, [3, pairs, batch]."""
     batch = x.shape[2]
-    # [3, k, pairs, batch], flat so that every gather is one of single numbers.
+    # [3, k, pairs, batch], flattened so that each gather reads scalars.
     corner = jnp.moveaxis(patch, (3, 2), (0, 1))
     flat = [x[:, i].reshape(-1) for i in range(3)]
     at = corner * batch + jnp.arange(batch, dtype=jnp.int32)[None, None, None]
@@ -130,7 +130,7 @@ def foot_of(x: Float[Array, "vertices 3 batch"], corners: Array, weights: Array)
     return sum(w[:, None] * rows_of(x, c) for w, c in zip(weights, corners, strict=True))  # pyright: ignore[reportReturnType]
 
 
-def keep_apart(
+def separate_pairs(
     displacement: Float[Array, "vertices 3 batch"],
     start: Float[Array, "vertices 3 batch"],
     pairs: Pairs,
@@ -139,32 +139,32 @@ def keep_apart(
     clock: Clock,
     progress: Array,
 ) -> Array:
-    """Displacements [m] after vertices and triangles have been pushed apart.
+    """Displacements [m] after the separation of vertices and triangles.
 
-    What was too close when the block began is parted no faster than ``leave`` [m/s],
-    so that tangled cloth comes apart instead of bursting. All pairs act at once, and
-    each vertex takes the mean of what they ask of it: order plays no part.
+    Pairs that are too close at the start of the contact interval separate no faster than
+    ``leave`` [m/s], so that tangled cloth comes apart without bursting. All pairs act at once, and
+    each vertex takes the mean of its corrections, so their order doesn't matter.
 
     Args:
-        displacement: Since the block's start [m].
-        start: At the substep's start [m].
-        pairs: The pairs of this block.
-        inverse_mass: [1/kg].
-        law: Gap, friction and speed of recovery.
-        clock: The block.
-        progress: Share of the block done.
+        displacement: Displacement since the start of the contact interval [m].
+        start: Displacement at the start of the substep [m].
+        pairs: Pairs of this interval.
+        inverse_mass: Inverse masses of the vertices [1/kg].
+        law: Gap, friction and speed of separation.
+        clock: Start and length of the interval.
+        progress: Fraction of the interval done.
     """
     lane = jnp.arange(displacement.shape[2])[None]
     index, share = pairs.members()
     mass = [inverse_mass[i, 0, 0][:, None] for i in index]
     n = pairs.normal
-    gone = pairs.parted(displacement)
+    relative = pairs.motion(displacement)
     height = pairs.heights(displacement)
-    wanted = jnp.minimum(law.gap, pairs.height + law.leave * progress * clock.length)
-    depth = jnp.maximum(wanted - height, 0.0) * pairs.active
+    target = jnp.minimum(law.gap, pairs.height + law.leave * progress * clock.length)
+    depth = jnp.maximum(target - height, 0.0) * pairs.active
     inertia = sum(s[:, None] ** 2 * w for s, w in zip(share, mass, strict=True))
     lift = depth / (inertia + 1e-9)
-    slide = gone - pairs.parted(start)
+    slide = relative - pairs.motion(start)
     slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
     length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
     hold = jnp.minimum(1.0, law.friction * depth / length) / (inertia + 1e-9)
@@ -180,7 +180,7 @@ def keep_apart(
 
 
 def side_normal(x: Float[Array, "vertices 3 batch"], corners: Int[Array, "3 pairs batch"]) -> Array:
-    """Unit normals of triangles, shape [pairs, 3, batch]; zero without area."""
+    """Unit normals of triangles, shape [pairs, 3, batch]; zero for triangles without area."""
     a, b, c = (rows_of(x, i) for i in corners)
     n = jnp.cross(b - a, c - a, axis=1)
     return n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-20)

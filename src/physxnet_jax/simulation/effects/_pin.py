@@ -1,4 +1,4 @@
-"""Pins: vertices that move with the skin beneath them."""
+"""Pins: vertices that move with the skin."""
 
 import dataclasses
 from typing import Any
@@ -9,37 +9,37 @@ from jaxtyping import Array, Int
 
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Attached, Clock, Effect, Placed, Prepared
+from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints
 
 
 @dataclasses.dataclass(frozen=True)
 class Pin(Effect):
-    """Pinned vertices of each garment stand exactly where skinning puts them."""
+    """Keeps the pinned vertices of each garment exactly at their skinned positions."""
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Takes the garments' own pins."""
+        """Collects the pinned vertices of all garments."""
         rows = np.flatnonzero(assembly.pinned)
-        attached = Attached(
+        skinned_points = SkinnedPoints(
             float32(assembly.rest[rows]),
             float32(np.zeros((len(rows), 3))),
             float32(assembly.weights[rows]),
         )
-        return _Pin(jnp.asarray(rows.astype(np.int32)), attached)
+        return _Pin(jnp.asarray(rows.astype(np.int32)), skinned_points)
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Pin(Prepared):
-    holds = True
+    kinematic = True
     index: Int[Array, " pins"]
-    skin: Attached
+    skin: SkinnedPoints
 
     @property
-    def attached(self) -> Attached:
+    def skinned_points(self) -> SkinnedPoints:
         return self.skin
 
     def begin(
-        self, base: Array, start: Placed, end: Placed, clock: Clock, memory: Any
+        self, base: Array, start: PosedPoints, end: PosedPoints, clock: Clock, state: Any
     ) -> tuple[Array, Array]:
         return start.points - base[self.index], end.points - start.points
 
@@ -51,5 +51,5 @@ class _Pin(Prepared):
         progress: Array,
         step: tuple[float, float],
     ) -> Array:
-        where, way = context
-        return displacement.at[self.index].set(where + progress * way, unique_indices=True)
+        offset, motion = context
+        return displacement.at[self.index].set(offset + progress * motion, unique_indices=True)

@@ -1,4 +1,4 @@
-"""Where the body passes through itself: how much room cloth has between two limbs."""
+"""Pinches: the gap for cloth between two limbs, also where the body intersects itself."""
 
 import dataclasses
 
@@ -12,34 +12,34 @@ from ...body import HANDS, Body, body_segments
 from ...geometry import spread_points
 from ...typing import pytree
 from .._assembly import float32
-from .._effect import Placed
+from .._effect import PosedPoints
 
 # Distance between the samples of the skin [m].
 _SPACING = 0.03
-# Skin nearer than this at rest belongs together [m].
-_APART = 0.06
-# Unless it already faces itself across this or more [m].
-_ASIDE = 0.01
-# Skin deeper than this below another's lies on the far side of a limb [m].
-_DEEP = 0.06
-# Positions are told from the nearest of places this far apart [m].
-_GRID = 16.0
-# Lateral reach of the test at rest that tells the far side of a limb [m].
-_BROAD = 0.08
-# More room than this is no pinch [m].
+# Samples closer than this at rest never count as facing each other [m], ...
+_MIN_REST_DISTANCE = 0.06
+# ... unless they already do at rest, across more than this [m].
+_MIN_REST_GAP = 0.01
+# Skin deeper than this below facing skin lies on the far side of a limb [m].
+_MAX_DEPTH = 0.06
+# Positions are taken relative to the nearest point of a grid with this spacing [m].
+_GRID_SPACING = 16.0
+# Lateral reach of the test at rest that detects the far side of a limb [m].
+_LATERAL_REACH = 0.08
+# Larger gaps aren't pinches [m].
 ROOM = 0.05
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class Pinch:
-    """Samples of the skin, and which of them can meet.
+    """Samples of the skin, and pairs of them that can face each other.
 
     Attributes:
-        samples: Rows of the skin's vertices.
-        facing: Pairs of samples that can come to face each other.
-        near: Samples around each skin vertex, of which room is interpolated.
-        weights: Their weights.
+        samples: Skin vertices of the samples.
+        facing: Pairs of samples that can face each other.
+        near: Samples around each skin vertex, from which its gap is interpolated.
+        weights: Interpolation weights.
     """
 
     samples: Int[Array, " samples"]
@@ -47,17 +47,17 @@ class Pinch:
     near: Int[Array, "3 skin"]
     weights: Float[Array, "3 skin 1"]
 
-    def room(self, skin: Placed) -> Float[Array, "skin batch"]:
+    def room(self, skin: PosedPoints) -> Float[Array, "skin batch"]:
         """Height of each skin vertex over the skin that faces it [m], at most `ROOM`.
 
-        Negative where the body passes through itself.
+        Negative where the body intersects itself.
         """
         p, n = skin.points[self.samples], skin.normals[self.samples]
         stop = jax.lax.stop_gradient
-        # Squares of coordinates far from the origin would drown the distances.
-        p = p - stop(_GRID * jnp.round(jnp.mean(p, axis=0, keepdims=True) / _GRID))
+        # Far from the origin, squares of coordinates would cancel with loss of precision.
+        p = p - stop(_GRID_SPACING * jnp.round(jnp.mean(p, axis=0, keepdims=True) / _GRID_SPACING))
         squared = jnp.sum(p * p, axis=1)
-        # The points' own squared length doesn't change which is the nearest.
+        # A point's own squared length doesn't change which sample is the nearest.
         gap = squared[None] - 2.0 * jnp.einsum(
             "sib,tib->stb", stop(p), stop(p), precision=jax.lax.Precision.HIGHEST
         )
@@ -68,13 +68,13 @@ class Pinch:
         height = jnp.sum(away * normal, axis=1)
         beside = jnp.sum(away * away, axis=1) - height**2
         opposed = jnp.sum(n * normal, axis=1) < 0
-        meets = (
-            (height > -_DEEP)
+        valid = (
+            (height > -_MAX_DEPTH)
             & (beside < _SPACING**2)
             & opposed
             & jnp.any(self.facing, axis=1)[:, None]
         )
-        room = jnp.where(meets, jnp.minimum(height, ROOM), ROOM)
+        room = jnp.where(valid, jnp.minimum(height, ROOM), ROOM)
         return jnp.sum(self.weights * room[self.near], axis=0)
 
 
@@ -84,17 +84,17 @@ def prepare_pinch(
     weights: Float[np.ndarray, "skin joints"],
     body: Body,
 ) -> Pinch:
-    """Samples the skin and finds at rest which parts of it are no single limb's two sides."""
+    """Samples the skin and finds, at rest, the pairs that aren't two sides of one limb."""
     pool = np.asarray(spread_points(skin, _SPACING))
     bone = body_segments(weights[pool], body)
     away = skin[pool][:, None] - skin[pool][None]
     squared = (away**2).sum(axis=2)
     height = np.einsum("stk,tk->st", away, normals[pool])
-    # Fingers have no one side that cloth could keep to: hands pass through it.
+    # Fingers have no single side on which cloth could stay: hands pass through it.
     hand = np.isin(bone, HANDS)
-    across = (height < 0) & (squared - height**2 < _BROAD**2)
+    across = (height < 0) & (squared - height**2 < _LATERAL_REACH**2)
     opposed = normals[pool] @ normals[pool].T < 0
-    beside = (squared < _APART**2) & ~(opposed & (height > _ASIDE))
+    beside = (squared < _MIN_REST_DISTANCE**2) & ~(opposed & (height > _MIN_REST_GAP))
     facing = (bone[:, None] != bone[None]) & ~beside & ~across
     facing &= ~hand[:, None] & ~hand[None]
     k = min(3, len(pool))

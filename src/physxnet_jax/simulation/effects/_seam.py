@@ -11,16 +11,16 @@ from ...errors import SimulationError, check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
-from ._coloured import Coloured, Constraint, Group, colour_group
+from ._colored import Colored, Constraint, Group, color_constraints
 
 
 @dataclasses.dataclass(frozen=True)
 class Seam(Effect):
-    """``E = 1/2 k |x_a - x_b|^2`` for each stitch, k stiff: panels are drawn together.
+    """``E = 1/2 k |x_a - x_b|^2`` for each stitch; a large ``k`` pulls panels together.
 
     Attributes:
-        stitches: Pairs of vertices of the scene, garments counted one after another.
-        stiffness: Of one stitch [N/m].
+        stitches: Pairs of vertices of the scene, numbered over all garments in order.
+        stiffness: Stiffness of one stitch [N/m].
 
     References:
         Baraff and Witkin, Large steps in cloth simulation (1998), for seams as springs.
@@ -38,22 +38,23 @@ class Seam(Effect):
         if pairs.size and not (0 <= pairs.min() and pairs.max() < len(assembly.rest)):
             wrong = int(pairs.min() if pairs.min() < 0 else pairs.max())
             raise SimulationError(
-                f"A stitch names vertex {wrong}; the scene has {len(assembly.rest)}, from 0."
+                f"A stitch names vertex {wrong}; the scene has {len(assembly.rest)} vertices,"
+                " numbered from 0."
             )
         law = {"compliance": np.full(len(pairs), 1.0 / self.stiffness)}
-        return _Seam(colour_group(pairs, np.asarray(inverse_mass), law))
+        return _Seam(color_constraints(pairs, np.asarray(inverse_mass), law))
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _Seam(Coloured):
+class _Seam(Colored):
     group: Group
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
-        def open_by(x: tuple[Array, ...]) -> Constraint:
+        def opening(x: tuple[Array, ...]) -> Constraint:
             span = x[1] - x[0]
             length = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18)
             n = span / length
             return Constraint(length, (-n, n), law["compliance"])
 
-        return [open_by]
+        return [opening]

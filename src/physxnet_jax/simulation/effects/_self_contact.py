@@ -17,23 +17,23 @@ from ._pairs import ClothContact, Facing, Pairs, closest_of, foot_of, side_norma
 
 @dataclasses.dataclass(frozen=True)
 class SelfContact(Effect):
-    """A garment's folds stay apart, each on the side on which a block found it.
+    """Keeps a garment's folds apart, on the sides they have at the start of an interval.
 
-    Every few blocks a grid of cells finds for each vertex the nearest vertex in front of
-    the cloth and the nearest behind it, neighbours left out (vertices of one piece that
-    are close at rest and face the same way). In each block the closest of the triangles
-    around them makes a pair, kept apart by the gap in the direction in which it was.
-    Edges that cross between vertices aren't seen: folds sharper than a triangle may cut
-    each other.
+    Every few contact intervals, a grid search finds for each vertex the nearest vertex in
+    front of the cloth and the nearest one behind it. Neighbours (vertices of one piece that
+    are close at rest and face the same way) are excluded. In each interval, the closest
+    triangle around each vertex found makes a pair, which keeps the gap along its direction
+    at the start. Edges that cross aren't detected: folds sharper than a triangle may
+    intersect each other.
 
     Attributes:
         gap: Distance kept [m].
         friction: Coulomb coefficient of cloth on itself [1].
-        leave: Folds that are too close are parted at this speed [m/s].
-        reach: Pairs nearer than this are watched [m]. The median edge at rest and the
-            gap if None; folds whose edges are twice as long leave gaps.
-        every: Blocks from one search of the grid to the next.
-        room: Vertices that a cell of the grid holds; more set the overflow bit.
+        leave: Speed at which folds that are too close separate [m/s].
+        reach: Pairs closer than this are active [m]. The median rest length of edges plus
+            the gap if None; folds with edges twice as long aren't fully covered.
+        every: Contact intervals between two grid searches.
+        room: Capacity of a grid cell in vertices; more set `Status.OVERFLOW`.
 
     References:
         Bridson, Fedkiw and Anderson, Robust treatment of collisions, contact and
@@ -54,7 +54,7 @@ class SelfContact(Effect):
         check_counts(self, "every", "room")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
-        """Tables of triangles and of who counts as a neighbour."""
+        """Builds tables of triangles and neighbours."""
         x, f = assembly.rest, assembly.faces
         ends = mesh_edges(f).vertices
         length = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1)
@@ -64,7 +64,7 @@ class SelfContact(Effect):
         n = np.zeros_like(x)
         for k in range(3):
             np.add.at(n, f[:, k], np.cross(x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]]))
-        return _Self(
+        return _SelfContact(
             jnp.asarray(x.astype(np.float32)),
             jnp.asarray(n.astype(np.float32)),
             jnp.asarray(connected_components(f, len(x))),
@@ -80,7 +80,7 @@ class SelfContact(Effect):
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _Self(ClothContact):
+class _SelfContact(ClothContact):
     rest: Float[Array, "vertices 3"]
     facing: Float[Array, "vertices 3"]
     piece: Int[Array, " vertices"]
@@ -92,38 +92,36 @@ class _Self(ClothContact):
     reach: float = dataclasses.field(metadata={"static": True})
     apart: float = dataclasses.field(metadata={"static": True})
 
-    def initial(self, batch: int) -> tuple[Array, Array, Array]:
+    def init_state(self, batch: int) -> tuple[Array, Array, Array]:
         count = self.rest.shape[0]
         none = jnp.full((2, count, batch), -1, jnp.int32)
         return jnp.zeros((), jnp.int32), none, jnp.zeros(batch, jnp.int32)
 
-    def begin(self, base: Array, start: None, end: None, clock: Clock, memory: tuple) -> Facing:
+    def begin(self, base: Array, start: None, end: None, clock: Clock, state: tuple) -> Facing:
         x = jax.lax.stop_gradient(base)
         batch = base.shape[2]
         search = jax.vmap(self.nearest, in_axes=2, out_axes=(2, 0))
-        near, crowd = jax.lax.cond(
-            memory[0] == 0, lambda: search(x), lambda: (memory[1], memory[2])
-        )
-        kept = (memory[0] + 1) % self.law.every, near, crowd
+        near, crowd = jax.lax.cond(state[0] == 0, lambda: search(x), lambda: (state[1], state[2]))
+        new_state = (state[0] + 1) % self.law.every, near, crowd
         # [2 vertices, batch]: in front of the cloth, then behind it.
         near = near.reshape(-1, batch)
         own = jnp.arange(base.shape[0], dtype=near.dtype)
         vertex = jnp.repeat(jnp.concatenate([own, own])[:, None], batch, axis=1)
         found = (near >= 0)[:, None]
         corners, weights = closest_of(x, jnp.concatenate([x, x]), self.around[jnp.maximum(near, 0)])
-        gone = jnp.concatenate([x, x]) - foot_of(x, corners, weights)
-        length = jnp.sqrt(jnp.sum(gone * gone, axis=1, keepdims=True) + 1e-18)
-        # On top of each other there is no direction but the triangle's own.
-        n = jnp.where(length > 1e-6, gone / length, side_normal(x, corners))
-        both = jnp.concatenate([base, base])
-        height = jnp.sum((both - foot_of(base, corners, weights)) * n, axis=1, keepdims=True)
+        offset = jnp.concatenate([x, x]) - foot_of(x, corners, weights)
+        length = jnp.sqrt(jnp.sum(offset * offset, axis=1, keepdims=True) + 1e-18)
+        # Coincident points have no direction: use the triangle's normal.
+        n = jnp.where(length > 1e-6, offset / length, side_normal(x, corners))
+        positions = jnp.concatenate([base, base])
+        height = jnp.sum((positions - foot_of(base, corners, weights)) * n, axis=1, keepdims=True)
         active = (found & (length < self.reach)).astype(base.dtype)
-        return Facing(Pairs(vertex, corners, weights, n, height, active), clock, kept)
+        return Facing(Pairs(vertex, corners, weights, n, height, active), clock, new_state)
 
     def nearest(self, x: Float[Array, "vertices 3"]) -> tuple[Int[Array, "2 vertices"], Array]:
-        """The nearest vertex on either side of the cloth, -1 for none, and the overflow."""
+        """The nearest vertex on each side of the cloth, -1 for none, and the overflow."""
         law, count = self.law, x.shape[0]
-        # A sphere of this radius touches at most the eight cells around a corner.
+        # A sphere of radius `reach` touches at most the eight cells around a corner.
         cell = 2.0 * self.reach
         size = 1 << int(np.ceil(np.log2(2 * count + 1)))
         safe = jnp.where(jnp.isfinite(x), x, 0.0) / cell
@@ -136,38 +134,38 @@ class _Self(ClothContact):
         home = jnp.floor(safe).astype(jnp.int32)
         slot = key(home)
         order = jnp.argsort(slot)
-        held = jnp.zeros(size, jnp.int32).at[slot].add(1)
-        begins = jnp.cumsum(held) - held
-        # The half of its cell in which a vertex lies says which neighbours count.
+        counts = jnp.zeros(size, jnp.int32).at[slot].add(1)
+        cell_starts = jnp.cumsum(counts) - counts
+        # The half of its cell in which a vertex lies determines the cells to search.
         first = jnp.floor(safe - 0.5).astype(jnp.int32)
         corner = jnp.asarray([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], jnp.int32)
         cells = key(first[:, None] + corner[None])
         lane = jnp.arange(law.room, dtype=jnp.int32)[None, None]
-        place = begins[cells][..., None] + lane
+        place = cell_starts[cells][..., None] + lane
         other = order[jnp.minimum(place, count - 1)].astype(jnp.int32)
-        ok = lane < held[cells][..., None]
-        other, ok = other.reshape(count, -1), ok.reshape(count, -1)
+        valid = lane < counts[cells][..., None]
+        other, valid = other.reshape(count, -1), valid.reshape(count, -1)
         gap = x[other] - x[:, None]
         squared = jnp.sum(gap * gap, axis=2)
         rest = self.rest[other] - self.rest[:, None]
         facing = jnp.sum(self.facing[other] * self.facing[:, None], axis=2) > 0
         beside = facing & (self.piece[other] == self.piece[:, None])
-        ok &= ~beside | (jnp.sum(rest * rest, axis=2) > self.apart**2)
-        ok &= other != jnp.arange(count, dtype=jnp.int32)[:, None]
-        ok &= self.part[other] == self.part[:, None]
-        ok &= squared < (2.0 * cell) ** 2
+        valid &= ~beside | (jnp.sum(rest * rest, axis=2) > self.apart**2)
+        valid &= other != jnp.arange(count, dtype=jnp.int32)[:, None]
+        valid &= self.part[other] == self.part[:, None]
+        valid &= squared < (2.0 * cell) ** 2
         normal = self.normals(x)
         front = jnp.sum(gap * normal[:, None], axis=2) >= 0
         out = []
         for side in (front, ~front):
-            measure = jnp.where(ok & side, squared, jnp.inf)
+            measure = jnp.where(valid & side, squared, jnp.inf)
             best = jnp.argmin(measure, axis=1)[:, None]
             there = jnp.isfinite(jnp.take_along_axis(measure, best, axis=1))[:, 0]
             out.append(jnp.where(there, jnp.take_along_axis(other, best, axis=1)[:, 0], -1))
-        return jnp.stack(out), jnp.sum(jnp.maximum(held - law.room, 0), dtype=jnp.int32)
+        return jnp.stack(out), jnp.sum(jnp.maximum(counts - law.room, 0), dtype=jnp.int32)
 
     def normals(self, x: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-        """Area-weighted vertex normals, not unit."""
+        """Area-weighted vertex normals, not normalised."""
         a, b, c = (x[self.faces[:, i]] for i in range(3))
         n = jnp.cross(b - a, c - a)
         return jnp.zeros_like(x).at[self.faces.reshape(-1)].add(jnp.repeat(n, 3, axis=0))
@@ -176,4 +174,4 @@ class _Self(ClothContact):
         pairs = context.pairs
         height = pairs.heights(displacement)
         gap = jnp.where(pairs.active > 0, height, jnp.inf)
-        return {"self_gap": gap.min(axis=(0, 1)), "overflow": context.kept[2]}
+        return {"self_gap": gap.min(axis=(0, 1)), "overflow": context.state[2]}

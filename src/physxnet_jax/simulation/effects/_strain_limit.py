@@ -1,4 +1,4 @@
-"""Strain limiting: edges never longer than so much more than at rest."""
+"""Strain limiting: an upper bound on the elongation of edges."""
 
 import dataclasses
 from typing import Any
@@ -12,17 +12,17 @@ from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared
-from ._coloured import Coloured, Constraint, Group, colour_group
+from ._colored import Colored, Constraint, Group, color_constraints
 
 
 @dataclasses.dataclass(frozen=True)
 class StrainLimit(Effect):
-    """Woven cloth stiffens sharply once its threads are straight: a hard bound.
+    """Bounds the elongation of edges: woven cloth stiffens once its threads are straight.
 
-    One sweep a substep; it stores no energy.
+    Runs one sweep per substep and stores no energy.
 
     Attributes:
-        limit: Greatest elongation as a share of the rest length.
+        limit: Maximum elongation relative to the rest length [1].
 
     References:
         Provot, Deformation constraints in a mass-spring model (1995).
@@ -39,12 +39,12 @@ class StrainLimit(Effect):
         ends = mesh_edges(assembly.faces).vertices
         length = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1)
         law = {"longest": (1 + self.limit) * np.maximum(length, 1e-4)}
-        return _StrainLimit(colour_group(ends, np.asarray(inverse_mass), law))
+        return _StrainLimit(color_constraints(ends, np.asarray(inverse_mass), law))
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _StrainLimit(Coloured):
+class _StrainLimit(Colored):
     elastic = False
     group: Group
 

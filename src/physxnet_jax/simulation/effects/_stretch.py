@@ -1,4 +1,4 @@
-"""Stretch: edges resist a change of length, less so when compressed."""
+"""Stretch: edges resist changes of length, compression less than tension."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,19 +13,19 @@ from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Clock, Effect, Prepared
-from ._coloured import Sheaf, bundled, column, directed, sheaves, sweep
+from ._colored import ColorGroup, bundled, color_groups, column, directed, sweep
 
 
 @dataclasses.dataclass(frozen=True)
 class Stretch(Effect):
     """Springs along edges: ``E = 1/2 sum k_e (|x_a - x_b| - L_e)^2``.
 
-    ``k_e = Y A_e / L_e^2`` with ``A_e`` the area of the triangles beside the edge
-    makes a regular mesh as stiff as a sheet of modulus ``Y`` [N/m] (the fabric's).
+    With ``k_e = Y A_e / L_e^2``, where ``A_e`` is the area of the triangles at the edge,
+    a regular mesh is as stiff as a sheet of the fabric's modulus ``Y`` [N/m].
 
     Attributes:
-        compression: Stiffness against shortening as a share of that against
-            lengthening: threads buckle below the size of a triangle.
+        compression: Stiffness in compression relative to that in tension [1]: threads
+            buckle below the size of a triangle.
 
     References:
         Macklin, Mueller and Chentanez, XPBD (2016), equation 18; van Gelder,
@@ -48,11 +48,11 @@ class Stretch(Effect):
         )
         load = np.zeros(len(length))
         np.add.at(load, edges.of_face, (assembly.stretch * area)[:, None])
-        # Edges of length zero keep their ends together with the stiffest spring there is.
+        # The bound gives edges of zero length the stiffest spring.
         stiffness = load / np.maximum(length, 1e-4) ** 2
         compliance = 1.0 / np.maximum(stiffness, 1e-6)
         w = np.asarray(inverse_mass)
-        order, parts = sheaves(edges.vertices, len(x))
+        order, parts = color_groups(edges.vertices, len(x))
         a, b = edges.vertices[order].T.astype(np.int32)
         springs = _Springs(
             (jnp.asarray(a), jnp.asarray(b)),
@@ -77,7 +77,7 @@ class _Springs:
 class _Stretch(Prepared):
     elastic = True
     springs: _Springs
-    sheaves: tuple[Sheaf, ...]
+    color_groups: tuple[ColorGroup, ...]
     softer: float = dataclasses.field(metadata={"static": True})
 
     materials = ("stretch",)
@@ -89,11 +89,11 @@ class _Stretch(Prepared):
         softer = dataclasses.replace(s, compliance=s.compliance / factors["stretch"])
         return dataclasses.replace(self, springs=softer)
 
-    def begin(self, base: Array, start: None, end: None, clock: Clock, memory: Any) -> tuple:
+    def begin(self, base: Array, start: None, end: None, clock: Clock, state: Any) -> tuple:
         s = self.springs
         edge = base[s.ends[1]] - base[s.ends[0]]
         known = (edge, s.weight, s.length, s.compliance)
-        return edge, bundled(self.sheaves, s.ends, known)
+        return edge, bundled(self.color_groups, s.ends, known)
 
     def project(
         self,
@@ -111,8 +111,8 @@ class _Stretch(Prepared):
             length = jnp.sqrt(jnp.sum(span * span, axis=1, keepdims=True) + 1e-18)
             excess = length - rest
             alpha = compliance * jnp.where(excess < 0, self.softer, 1.0) / (h * h)
-            pull = span * (excess / (length * (wa + wb + alpha)))
-            return [da + wa * pull, db - wb * pull]
+            correction = span * (excess / (length * (wa + wb + alpha)))
+            return [da + wa * correction, db - wb * correction]
 
         return sweep(displacement, context[1], move)
 
@@ -131,7 +131,7 @@ class _Stretch(Prepared):
         return np.concatenate([np.column_stack(p) for p in ((a, a), (b, b), (a, b), (b, a))])
 
     def hessian(self, displacement: Array, context: tuple) -> Array:
-        """Along the edge always, across it only in tension: so it stays positive."""
+        """Stiffness along the edge, and across it only in tension: positive semidefinite."""
         s = self.springs
         eye = jnp.eye(3, dtype=displacement.dtype)[None, None]
         span = jnp.swapaxes(self._spans(displacement, context), 1, 2)

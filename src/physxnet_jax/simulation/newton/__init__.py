@@ -1,4 +1,4 @@
-"""Newton's cloth as another engine, in a process of its own; never imported."""
+"""Newton's cloth simulator as an external engine, in a separate process; never imported."""
 
 from ._engine import (
     NewtonSettings as NewtonSettings,

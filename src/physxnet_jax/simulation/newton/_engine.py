@@ -1,4 +1,4 @@
-"""Hands a scene to Newton and takes back the cloth."""
+"""Runs a scene in Newton and reads back the cloth."""
 
 import dataclasses
 import os
@@ -9,7 +9,7 @@ from collections.abc import Callable
 from ...errors import MissingDependencyError, check_counts, check_numbers
 from ...motion import Motion
 from .._diagnostics import Rollout
-from .._outside import simulate_outside
+from .._external_engine import run_external_engine
 from .._scene import Scene, prepare_scene
 
 _SCRIPT = pathlib.Path(__file__).with_name("_script.py")
@@ -20,16 +20,16 @@ class NewtonSettings:
     """Settings of Newton's vertex block descent (`SolverVBD`).
 
     Attributes:
-        substeps: Steps a frame.
-        iterations: Of the solver in each step.
-        density: Of the cloth [kg/m^2].
-        stretch: Both stiffnesses of its triangles [N/m].
-        bend: Of its hinges [N m].
-        damping: Of its triangles, relative to their stiffness [s].
+        substeps: Steps per frame.
+        iterations: Solver iterations per step.
+        density: Density of the cloth [kg/m^2].
+        stretch: Stiffness of the triangles, for ``tri_ke`` and ``tri_ka`` [N/m].
+        bend: Stiffness of the hinges [N m].
+        damping: Damping of triangles and hinges, relative to their stiffness [s].
         radius: Distance kept from the skin [m].
         contact: Stiffness of contact [N/m].
-        friction: Coulomb's coefficient.
-        self_collision: Cloth collides with itself.
+        friction: Coulomb coefficient [1].
+        self_collision: Whether cloth collides with itself.
     """
 
     substeps: int = 10
@@ -50,16 +50,16 @@ class NewtonSettings:
 
 
 def find_newton() -> list[str]:
-    """The command that runs a script with Newton: the Python named by ``PHYSXNET_NEWTON``.
+    """The command that runs the script with the Python in ``PHYSXNET_NEWTON``.
 
     Raises:
-        MissingDependencyError: It isn't set, or is no program.
+        MissingDependencyError: The variable isn't set, or names no executable.
     """
     program = os.environ.get("PHYSXNET_NEWTON")
     if program is None or shutil.which(program) is None:
         raise MissingDependencyError(
-            "No Newton: set PHYSXNET_NEWTON to a Python that has it (pip install newton, in"
-            " an environment of its own)."
+            "Newton not found: set PHYSXNET_NEWTON to a Python with Newton (pip install newton,"
+            " in a separate environment)."
         )
     return [program, str(_SCRIPT)]
 
@@ -71,27 +71,27 @@ def simulate_newton(
     settings: NewtonSettings | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Rollout:
-    """Simulates a scene in Newton, with the lead-in that `simulate` has.
+    """Simulates a scene in Newton, with the same warm-up as `simulate`.
 
-    Effects of the scene are not looked at, only its garments, body and shape. The skin's
-    triangles are moved by hand each step, between frames along straight lines.
+    Uses the scene's garments, body and shape and ignores its effects. The skin's
+    triangles are updated in each substep, with linear interpolation between frames.
 
     Args:
         scene: Garments and body.
         motion: The body's motion.
-        settings: Of the solver.
-        progress: Called with frames done and frames in all.
+        settings: Settings of the solver.
+        progress: Called with the number of frames done and the total.
 
     Returns:
-        Positions, and the diagnostics that `simulate_blender` gives.
+        Positions, and the same diagnostics as `simulate_blender`.
 
     Raises:
-        MissingDependencyError: No Newton.
-        SimulationError: Newton failed; its last words are given.
+        MissingDependencyError: Newton isn't found.
+        SimulationError: Newton failed; the message ends with its last output.
     """
     settings = NewtonSettings() if settings is None else settings
     scene = dataclasses.replace(scene, effects=())
-    return simulate_outside(
+    return run_external_engine(
         "Newton",
         find_newton(),
         prepare_scene(scene),

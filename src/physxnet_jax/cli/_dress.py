@@ -1,0 +1,295 @@
+"""`physxnet dress`, `simulate` and `demo`: load, dress, write, report."""
+
+import dataclasses
+import pathlib
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+from rich.console import Console
+
+from ..body import load_body
+from ..dressing import (
+    Character,
+    DressedClip,
+    Inference,
+    Simulation,
+    dress,
+    load_character,
+    load_scene,
+)
+from ..errors import FormatError, PhysXNetError
+from ..garment import parse_wear
+from ..io import check_output, write_clip
+from ..motion import Motion, load_motion
+from ..viewer import check_preview, render_preview
+from ._calibrate import choose
+from ._commands import Demo, Dress, Effects, Simulate
+from ._options import BodyOptions, MotionSource, Outfit, changed, check_body
+from ._progress import UNWRITTEN, print_json, progress_bars
+from ._shape import parse_shape
+from ._table import closing_table, report, rollout_report, rollout_table
+
+_Progress = Callable[[str, int, int], None]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class _Job:
+    """Arguments of `px.dress`, and notes on the input."""
+
+    motion: Motion | Character
+    wear: Any
+    shape: Any
+    method: Literal["network", "lbs", "simulate"]
+    inference: Inference
+    simulation: Simulation
+    frames: int | None
+    fps: float
+    start: float
+    notes: tuple[str, ...] = ()
+
+
+def run_dress(command: Dress, console: Console, still: pathlib.Path | None = None) -> int:
+    """Dresses a motion by any method."""
+    _check_method(command)
+    check_body(command.person, command.source)
+    output = command.output
+    pictures = [p for p in (output.preview, still) if p is not None]
+    _check_files(output.out, pictures, console)
+    with progress_bars(console) as progress:
+        selected = choose(command, progress)
+        options: dict[str, Any] = {
+            "method": command.method,
+            "inference": command.inference.build(),
+            "simulation": command.simulation.build(),
+        }
+        options |= {} if selected is None else selected.profile.options
+        job = _job(
+            command.motion, command.source, command.outfit, command.person, options, progress
+        )
+        clip, written, _ = _run(job, output, pictures, progress)
+    if output.json:
+        choice = {} if selected is None else {"picked": selected.summary}
+        print_json(report(clip) | choice | {"files": written})
+        return 0
+    for table in closing_table(clip):
+        console.print(table)
+    if selected is not None:
+        console.print(selected.summary, highlight=False)
+    _print_end(clip, (), written, console)
+    return 0
+
+
+def run_simulate(command: Simulate, console: Console) -> int:
+    """Simulates a motion with garments, or a scene file."""
+    check_body(command.person, command.source)
+    output = command.output
+    pictures = [] if output.preview is None else [output.preview]
+    if not output.json:
+        _check_files(output.out, pictures, console)
+    else:
+        _check_files(output.out, pictures, Console(quiet=True))
+    first = output.out or output.preview
+    resume_folder = None if first is None else first.with_name(f".{first.name}.unfinished")
+    quiet = Console(quiet=True, markup=False) if output.json else console
+    with progress_bars(quiet) as progress:
+        if is_scene_file(command.scene):
+            job = _scene_job(command)
+        else:
+            options = {"method": "simulate", "simulation": command.simulation.build()}
+            job = _job(
+                command.scene, command.source, command.outfit, command.person, options, progress
+            )
+        simulation = dataclasses.replace(job.simulation, resume=resume_folder)
+        job = dataclasses.replace(job, simulation=simulation)
+        clip, written, seconds = _run(job, output, pictures, progress)
+    if output.json:
+        files = {"notes": [*job.notes, *clip.notes], "files": written}
+        print_json(rollout_report(clip, job.simulation, seconds) | files)
+        return 0
+    console.print(rollout_table(clip, job.simulation, seconds))
+    _print_end(clip, job.notes, written, console)
+    return 0
+
+
+def run_demo(command: Demo, console: Console) -> int:
+    """Dresses a built-in walk, and writes USD, video and image."""
+    base = Dress("walk")
+    job = dataclasses.replace(
+        base,
+        source=dataclasses.replace(base.source, frames=command.frames),
+        output=dataclasses.replace(
+            base.output,
+            out=command.out / "demo.usdc",
+            preview=command.out / "demo.mp4",
+            quiet=command.quiet,
+            json=command.json,
+        ),
+    )
+    return run_dress(job, console, still=command.out / "demo.png")
+
+
+def is_scene_file(word: str) -> bool:
+    """Whether the argument names a scene file instead of a motion."""
+    return pathlib.Path(word).suffix.lower() == ".toml"
+
+
+def scene_file(command: Simulate | Effects) -> Any:
+    """Loads a scene file, with the requested number of frames.
+
+    Raises:
+        FormatError: An option is given that the scene file has to state.
+    """
+    source = dataclasses.replace(command.source, frames=MotionSource().frames)
+    given = [*changed(source), *changed(command.outfit), *changed(command.simulation)]
+    given = [g for g in given if g not in ("--accuracy", "--engine")]
+    if isinstance(command, Simulate):
+        given += changed(command.person)
+    if given:
+        raise FormatError(
+            f"{command.scene}: a scene file states its garments, fabrics, effects and motion;"
+            f" write it there and leave {given[0]} out."
+        )
+    return load_scene(command.scene, frames=command.source.frames)
+
+
+def _scene_job(command: Simulate) -> _Job:
+    found = scene_file(command)
+    accuracy = command.simulation.accuracy
+    accuracy = found.accuracy if accuracy == Simulation().accuracy else accuracy
+    engine = command.simulation.engine
+    simulation = dataclasses.replace(
+        command.simulation.build(),
+        accuracy=accuracy if engine == "xpbd" else Simulation().accuracy,
+        effects=found.scene.effects,
+    )
+    return _Job(
+        motion=found.motion,
+        wear=found.scene.garments,
+        shape=found.scene.shape,
+        method="simulate",
+        inference=Inference(),
+        simulation=simulation,
+        frames=None,
+        fps=found.motion.fps,
+        start=0.0,
+        notes=found.notes,
+    )
+
+
+def _job(
+    word: str,
+    source: MotionSource,
+    outfit: Outfit,
+    person: BodyOptions,
+    options: dict[str, Any],
+    progress: _Progress,
+) -> _Job:
+    """Loads the motion, and the character that it drives."""
+    shape = load_body().shape(**parse_shape(person.shape)) if person.shape else None
+    motion: Any = None
+    if not person.animated_body:
+        motion = load_motion(
+            word,
+            fps=source.fps,
+            source_fps=source.source_fps,
+            skeleton=source.skeleton,
+            joint_map=source.joint_map,
+            shape=shape,
+        )
+    custom = word if person.animated_body else person.character
+    if custom is not None:
+        motion = load_character(
+            custom,
+            fps=source.fps,
+            source_fps=source.source_fps,
+            mesh=person.body_mesh,
+            frames=source.frames,
+            motion=motion,
+            joint_map=person.character_map,
+            progress=progress,
+        )
+    defaults = {"inference": Inference(), "simulation": Simulation()}
+    return _Job(
+        motion=motion,
+        wear=outfit.words,
+        shape=shape,
+        frames=source.frames,
+        fps=source.fps,
+        start=source.start,
+        **(defaults | options),
+    )
+
+
+def _run(
+    job: _Job, output: Any, pictures: list[pathlib.Path], progress: _Progress
+) -> tuple[DressedClip, list[pathlib.Path], float]:
+    motion = job.motion if isinstance(job.motion, Motion) else job.motion.motion
+    if output.out is not None:
+        check_output(output.out, min(motion.num_frames, job.frames or motion.num_frames))
+    began = time.perf_counter()
+    clip = dress(
+        job.motion,
+        job.wear,
+        method=job.method,
+        inference=job.inference,
+        simulation=job.simulation,
+        fps=job.fps,
+        start=job.start,
+        frames=job.frames,
+        shape=job.shape,
+        include_body=output.body,
+        progress=progress,
+    )
+    seconds = time.perf_counter() - began
+    written: list[pathlib.Path] = []
+    if output.out is not None:
+        written += write_clip(output.out, clip.meshes, clip.fps)
+    for picture in pictures:
+        written.append(render_preview(picture, clip.meshes, clip.fps, progress=progress))
+    return clip, written, seconds
+
+
+def _check_files(out: pathlib.Path | None, pictures: list[pathlib.Path], console: Console) -> None:
+    """Checks before the computation that all files can be written."""
+    if out is not None:
+        check_output(out)
+    for picture in pictures:
+        check_preview(picture)
+    if out is None and not pictures:
+        console.print(UNWRITTEN)
+
+
+def _check_method(command: Dress) -> None:
+    """Rejects options that another option would make ineffective."""
+    method = [] if command.method == "network" else ["--method"]
+    given = [*method, *changed(command.inference), *changed(command.simulation)]
+    if (command.budget_ms, command.max_error_mm) != (None, None) and given:
+        raise PhysXNetError(
+            f"--budget-ms and --max-error-mm select the method: leave out {given[0]}."
+        )
+    if command.budget_ms is not None and command.max_error_mm is not None:
+        raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
+    if command.method != "simulate" and changed(command.simulation):
+        flag = changed(command.simulation)[0]
+        raise PhysXNetError(f"{flag} is an option of the simulator: add --method simulate.")
+    if command.method != "simulate" and any(parse_wear(w).fabric for w in command.outfit.words):
+        raise PhysXNetError(
+            "--fabric, fabric=: the networks support one fabric. Add --method simulate, or leave"
+            " it out."
+        )
+    of_networks = {"--weights", "--tta", "--strain-iterations"}
+    if command.method != "network" and of_networks & set(changed(command.inference)):
+        raise PhysXNetError(f"--weights are for networks: --method {command.method} has none.")
+
+
+def _print_end(
+    clip: DressedClip,
+    notes: tuple[str, ...],
+    written: list[pathlib.Path],
+    console: Console,
+) -> None:
+    for note in dict.fromkeys((*notes, *clip.notes)):
+        console.print(note, highlight=False, markup=False, soft_wrap=True)
+    for path in written:
+        console.print(f"wrote {path} (import at {clip.fps:g} fps)", highlight=False, soft_wrap=True)

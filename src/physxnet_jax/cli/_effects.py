@@ -1,0 +1,77 @@
+"""`physxnet effects`: what each effect of a scene costs and changes."""
+
+import dataclasses
+
+from rich.console import Console
+from rich.table import Table
+
+from ..dressing import make_scene
+from ..evaluation import price_effects, recommend_effects
+from ..files import check_writable, write_json
+from ..simulation import PRESETS
+from ._commands import Effects
+from ._dress import is_scene_file, scene_file
+from ._progress import print_json, progress_bars
+
+
+def price(command: Effects, console: Console) -> int:
+    """Prints the cost of a scene's effects, and recommendations on request."""
+    if command.out is not None:
+        check_writable(command.out)
+    if is_scene_file(command.scene):
+        job = scene_file(command)
+    else:
+        job = make_scene(
+            command.scene,
+            command.outfit.words,
+            simulation=command.simulation.build(),
+            **dataclasses.asdict(command.source),
+        )
+    solver = PRESETS[job.accuracy].at_rate(job.motion.fps)
+    with progress_bars(console) as bars:
+        rows = price_effects(
+            job.scene, job.motion, solver=solver, progress=lambda d, t: bars("effects", d, t)
+        )
+        advice = []
+        if command.recommend:
+            advice = recommend_effects(
+                job.scene,
+                job.motion,
+                solver=solver,
+                tolerance=1e-3 * command.tolerance,
+                rows=rows,
+                progress=lambda d, t: bars("recommendation", d, t),
+            )
+    table = Table(
+        title=f"{rows[0].frames} frames: the scene, then without each of its effects",
+        caption="strain: 99th percentile; ms: per frame; Mflop: each loop body counted once",
+        title_justify="left",
+    )
+    table.add_column("without", no_wrap=True)
+    for column in ("rms mm", "max mm", "strain", "inside", "ms", "Mflop"):
+        table.add_column(column, justify="right")
+    for r in rows:
+        table.add_row(
+            r.without or "nothing",
+            f"{r.rms_mm:.2f}",
+            f"{r.max_mm:.1f}",
+            f"{r.strain_p99:.3f}",
+            f"{100 * r.inside_share:.2f} %",
+            f"{r.ms_per_frame:.1f}",
+            f"{r.mflop:.2f}",
+        )
+    console.print(table)
+    for note in job.notes:
+        console.print(note, highlight=False, markup=False, soft_wrap=True)
+    for a in advice:
+        console.print(f"{a.effect}: {'needed' if a.needed else 'not needed'}. {a.why}")
+    data = {
+        "effects": [dataclasses.asdict(r) for r in rows],
+        "recommendation": [dataclasses.asdict(a) for a in advice],
+        "notes": list(job.notes),
+    }
+    if command.out is not None:
+        write_json(command.out, data)
+    if command.console.json:
+        print_json(data)
+    return 0

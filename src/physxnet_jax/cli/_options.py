@@ -1,0 +1,175 @@
+"""Groups of options that commands share, as dataclasses that tyro reads."""
+
+import dataclasses
+import pathlib
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from ..errors import PhysXNetError
+
+if TYPE_CHECKING:
+    from ..dressing import Inference, Simulation
+
+Fabric = Literal["cotton", "denim", "silk", "wool", "jersey", "leather"]
+
+
+@dataclasses.dataclass(frozen=True)
+class InferenceOptions:
+    """Network and post-processing."""
+
+    weights: str = "local"
+    """Name or folder of network weights (see `physxnet clips`)."""
+    tta: bool = False
+    """Average with the prediction for the mirrored pose (test-time augmentation)."""
+    strain_iterations: int = 8
+    """Iterations of strain limiting after the network; 0 disables it."""
+    collisions: bool = True
+    """Resolve collisions: move vertices inside the body onto it, keep garments in layers."""
+
+    def build(self) -> "Inference":
+        """Builds the options of the Python API."""
+        from ..dressing import Inference
+
+        return Inference(**dataclasses.asdict(self))
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationOptions:
+    """Simulation."""
+
+    accuracy: Literal["draft", "standard", "fine"] = "standard"
+    """Accuracy of the simulation; higher accuracy takes more time."""
+    engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
+    """bdf2: implicit, second order. blender, newton: external processes (PHYSXNET_BLENDER,
+    PHYSXNET_NEWTON)."""
+    wind: tuple[float, float, float] | None = None
+    """Steady wind [m/s]."""
+    self_contact: bool = False
+    """Let garments collide with themselves."""
+
+    def build(self) -> "Simulation":
+        """Builds the options of the Python API."""
+        from ..dressing import Simulation
+
+        return Simulation(**{f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+
+
+@dataclasses.dataclass(frozen=True)
+class MotionSource:
+    """Motion."""
+
+    fps: float = 30.0
+    """Frame rate of the result [1/s]."""
+    start: float = 0.0
+    """Start at this time of the motion [s]."""
+    frames: int | None = None
+    """Stop after this many frames."""
+    source_fps: float | None = None
+    """True frame rate of the motion file, if its header is wrong or lacks it."""
+    skeleton: pathlib.Path | None = None
+    """The ASF file of an AMC file, if it isn't in the same folder."""
+    joint_map: pathlib.Path | None = None
+    """TOML file for unknown joint names of the motion file, with lines like Hips = "pelvis"."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Outfit:
+    """Outfit."""
+
+    wear: tuple[str, ...] = ("top", "bottom")
+    """Templates (top, bottom, dress) and files (.obj, .glb, .gltf, .usd*, .ply, .stl), with
+    options after a colon: coat.obj:as=top,fabric=wool. Tops go over dresses, dresses over
+    trousers; among garments of one type, later ones are outer."""
+    fabric: Fabric | None = None
+    """Fabric of all garments that don't name one."""
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The garments, with the default fabric for those that don't name one."""
+        from ..garment import with_default_fabric
+
+        return with_default_fabric(self.wear, self.fabric)
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyOptions:
+    """Body."""
+
+    shape: tuple[str, ...] = ()
+    """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
+    animated_body: bool = False
+    """The motion file is an animated person to dress: .glb, .usd, .pc2, .mdd (with OBJ), .npz."""
+    character: pathlib.Path | None = None
+    """A rigged character (.glb, .gltf, .vrm) that the motion drives."""
+    character_map: pathlib.Path | None = None
+    """TOML file for unknown joint names of --character, with lines like Hips = "pelvis"."""
+    body_mesh: str | None = None
+    """Name of the body's mesh in a file with several, for --animated-body and --character."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Console:
+    """Terminal."""
+
+    json: bool = False
+    """Print JSON instead of tables."""
+    quiet: bool = False
+    """Print errors only."""
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """Output."""
+
+    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
+    """Result: .usdc, .usd, .usda, .pc2, .mdd (with OBJ), .glb, .html, .obj (one a frame), .npz."""
+    preview: pathlib.Path | None = None
+    """Image or video: .png, .gif or .mp4."""
+    body: bool = True
+    """Include the body in the result."""
+    json: bool = False
+    """Print JSON instead of tables."""
+    quiet: bool = False
+    """Print errors only."""
+    debug: bool = False
+    """Show the traceback of an error."""
+
+
+def changed(group: Any) -> list[str]:
+    """Flags of a group that differ from their defaults."""
+    defaults = type(group)()
+    return [
+        f"--{f.name.replace('_', '-')}"
+        for f in dataclasses.fields(group)
+        if getattr(group, f.name) != getattr(defaults, f.name)
+    ]
+
+
+def check_body(options: BodyOptions, source: MotionSource) -> None:
+    """Checks that the body options are compatible.
+
+    Raises:
+        PhysXNetError: They aren't; the message names the options to leave out or to add.
+    """
+    if options.animated_body and (options.shape or source.joint_map or source.skeleton):
+        raise PhysXNetError(
+            "--animated-body has its own shape and needs no joints: leave out --shape,"
+            " --joint-map and --skeleton."
+        )
+    if options.character is not None and (options.shape or options.animated_body):
+        raise PhysXNetError(
+            "--character has its own shape and is driven by the motion file: leave out"
+            " --shape and --animated-body."
+        )
+    custom = options.animated_body or options.character is not None
+    if options.body_mesh is not None and not custom:
+        raise PhysXNetError(
+            "--body-mesh selects a mesh of --animated-body or --character: add one of them."
+        )
+    if options.character_map is not None and options.character is None:
+        raise PhysXNetError("--character-map names joints of --character: add --character.")
+    if source.start and custom:
+        raise PhysXNetError("--start cuts motions of the built-in body only: leave it out.")

@@ -1,0 +1,188 @@
+"""Training frames in memory, and batches that depend on the step number alone."""
+
+import dataclasses
+import hashlib
+from collections.abc import Iterable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from ..body import Body
+from ..errors import FormatError
+from ..garment import Garment
+from ..geometry import polar_rotation
+from ..motion import clip_transforms
+from ._store import QUANTIZATION_STEP, Sequence
+
+# Largest usable offsets from skinning [m]. Beyond the first, a sleeve or trouser leg is off its
+# limb. Skirts may swing further; beyond the second, they have come off. Targets must also fit
+# int16 in units of 0.1 mm.
+MAX_OFFSET, MAX_SKIRT = 0.5, 3.0
+
+
+def pose_windows(
+    values: Float[Array, "frames ..."] | Float[np.ndarray, "frames ..."], window: int
+) -> Float[Array, "frames window ..."] | Float[np.ndarray, "frames window ..."]:
+    """The window of poses up to each frame; the first pose is repeated before frame 0."""
+    frames = values.shape[0]
+    index = np.arange(frames)[:, None] + np.arange(1 - window, 1)[None]
+    return values[np.maximum(index, 0)]
+
+
+# Cloth this deep in the body [m] has come off: such a sequence isn't used for training.
+MAX_PENETRATION = 0.1
+
+
+_CHUNK = 16
+
+
+@dataclasses.dataclass(frozen=True)
+class Frames:
+    """All training frames.
+
+    Attributes:
+        rotations: World rotations of joints over each frame's window, shape
+            [frames, window, joints, 3, 3].
+        translations: World translations [m], shape [frames, window, joints, 3].
+        targets: For each template, cloth offsets [0.1 mm], shape [frames, vertices, 3].
+        usable: For each template, which frames are usable, shape [frames].
+        fps: Frames per second.
+        identity: Names, lengths and content hashes of the sequences; ties a run to its data.
+    """
+
+    rotations: Float[np.ndarray, "frames window joints 3 3"]
+    translations: Float[np.ndarray, "frames window joints 3"]
+    targets: dict[str, np.ndarray]
+    usable: dict[str, Bool[np.ndarray, " frames"]]
+    fps: float
+    identity: str
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+
+def usable_garment(meta: dict) -> bool:
+    """Whether a simulated garment stayed on the body."""
+    # Penetration isn't measured for a network's predictions, which can't come off.
+    return bool(meta["finite"]) and meta["worst"].get("penetration_max", 0.0) <= MAX_PENETRATION
+
+
+def is_trainable(sequence: Sequence, name: str) -> bool:
+    """Whether a simulated garment is usable for training: it stayed on the body and its limbs."""
+    if name not in sequence.offsets or not usable_garment(sequence.meta[name]):
+        return False
+    most = MAX_SKIRT if name == "dress" else MAX_OFFSET
+    return bool((np.linalg.norm(sequence.offsets[name], axis=2) <= most).all())
+
+
+def load_frames(
+    sequences: Iterable[Sequence],
+    garments: dict[str, Garment],
+    body: Body,
+    rest: Float[Array, "all 3"],
+    *,
+    window: int,
+    local: bool,
+) -> Frames:
+    """Pose windows and cloth targets of all sequences, in a single pass over them.
+
+    Targets are cloth offsets in the family's frame. For ``local``: cloth minus its
+    skinning, in each cloth vertex's own frame. For ``paper``: cloth positions relative to
+    their skinning in the world frame (the skin is subtracted at the texels).
+
+    Raises:
+        FormatError: No sequences, or sequences of different frame rates.
+    """
+    rotations, translations, hashes = [], [], []
+    rates: set[float] = set()
+    targets: dict[str, list] = {t: [] for t in garments}
+    usable: dict[str, list] = {t: [] for t in garments}
+    for s in sequences:
+        rates.add(s.motion.fps)
+        if len(rates) != 1:
+            raise FormatError(f"sequences of different frame rates: {sorted(rates)}.")
+        hashes.append(f"{s.name} {s.motion.num_frames} {_content_hash(s)}")
+        world, shift = clip_transforms(body, rest, s.motion)
+        rotations.append(np.asarray(pose_windows(world, window)))
+        translations.append(np.asarray(pose_windows(shift, window)))
+        for name, g in garments.items():
+            trainable = is_trainable(s, name)
+            usable[name].append(np.full(len(world), trainable))
+            if not trainable:
+                targets[name].append(np.zeros((len(world), g.num_vertices, 3), dtype=np.int16))
+                continue
+            offset = s.offsets[name]
+            if local:
+                offset = _to_local(g, world, offset)
+            targets[name].append(np.round(offset / QUANTIZATION_STEP).astype(np.int16))
+    if not hashes:
+        raise FormatError("no sequence to train on; build a dataset first.")
+    cat = np.concatenate
+    return Frames(
+        cat(rotations),
+        cat(translations),
+        # Targets take gigabytes: parts are released as soon as they are concatenated.
+        {t: cat(targets.pop(t)) for t in garments},
+        {t: cat(v) for t, v in usable.items()},
+        rates.pop(),
+        ", ".join(hashes),
+    )
+
+
+def _content_hash(sequence: Sequence) -> str:
+    """A short hash of a sequence's cloth, from the dataset's checksums where it stores them."""
+    digest = hashlib.sha256()
+    for name, offsets in sorted(sequence.offsets.items()):
+        hashes = sequence.meta[name].get("sha256")
+        hashes = hashlib.sha256(offsets.tobytes()).hexdigest() if hashes is None else hashes
+        digest.update(f"{name} {hashes}\n".encode())
+    return digest.hexdigest()[:8]
+
+
+def _to_local(
+    garment: Garment, world: np.ndarray, offset: np.ndarray
+) -> Float[np.ndarray, "frames vertices 3"]:
+    frames = len(world)
+    pick = np.minimum(np.arange(-(-frames // _CHUNK) * _CHUNK), frames - 1)
+    out = [
+        np.asarray(
+            _rotate_back(garment.skin, world[pick[i : i + _CHUNK]], offset[pick[i : i + _CHUNK]])
+        )
+        for i in range(0, len(pick), _CHUNK)
+    ]
+    return np.concatenate(out)[:frames]
+
+
+@jax.jit
+def _rotate_back(skin: Array, world: Array, offset: Array) -> Array:
+    def one(r: Array, o: Array) -> Array:
+        blend = jnp.matmul(skin, r.reshape(-1, 9), precision=jax.lax.Precision.HIGHEST).reshape(
+            -1, 3, 3
+        )
+        return jnp.einsum(
+            "vba,vb->va", polar_rotation(blend), o, precision=jax.lax.Precision.HIGHEST
+        )
+
+    return jax.vmap(one)(world, offset)
+
+
+def batch_indices(num_frames: int, batch: int, seed: int, step: int) -> np.ndarray:
+    """Frames of a step: a new permutation every epoch, determined by the step alone."""
+    per_epoch = max(num_frames // batch, 1)
+    epoch, at = divmod(step, per_epoch)
+    order = np.random.default_rng([seed, epoch]).permutation(num_frames)
+    return np.resize(order[at * batch : (at + 1) * batch], batch)
+
+
+def take(frames: Frames, index: np.ndarray) -> dict[str, np.ndarray]:
+    """The arrays of one batch."""
+    out = {
+        "rotations": frames.rotations[index],
+        "translations": frames.translations[index],
+    }
+    for t in frames.targets:
+        out[f"target_{t}"] = frames.targets[t][index]
+        out[f"weight_{t}"] = frames.usable[t][index].astype(np.float32)
+    return out

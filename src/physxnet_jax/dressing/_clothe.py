@@ -1,0 +1,229 @@
+"""Pure functions from joint rotations to garment vertices."""
+
+import dataclasses
+import functools
+from collections.abc import Iterator, Mapping
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..body import Body, skin_points
+from ..models import apply_sampled_offsets, normalise, point_features
+from ..motion import extrapolate_history
+from ..typing import pytree
+from ._dresser import Dresser
+from ._pipeline import bound, infer, limit, predict_cloth, resolve
+from .postprocess import Cloth
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, eq=False)
+class Clothed(Mapping[str, Array]):
+    """Garments in one pose or in several frames: a mapping from names to vertices.
+
+    Attributes:
+        vertices: Vertices of each garment by name [m], shape
+            ``[*frames, vertices, 3]``.
+        ok: Whether all vertices are finite. A non-finite joint affects only the frames
+            whose window contains it.
+    """
+
+    vertices: dict[str, Float[Array, "*frames vertices 3"]]
+    ok: Bool[Array, "*frames"]
+
+    # `Mapping` compares values, and comparing arrays gives no single truth value.
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__  # pyright: ignore[reportAssignmentType]
+
+    def __getitem__(self, name: str) -> Float[Array, "*frames vertices 3"]:
+        """Vertices of a garment [m]."""
+        return self.vertices[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """Names of the garments."""
+        return iter(self.vertices)
+
+    def __len__(self) -> int:
+        """Number of garments."""
+        return len(self.vertices)
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Stream:
+    """The state between two frames of a stream.
+
+    Attributes:
+        points: Skinned texel points of the last `Dresser.history_length` frames [m],
+            oldest first, shape [history, texels, 3]; None for skinning alone.
+    """
+
+    points: Float[Array, "history texels 3"] | None
+
+
+def _make_clothed(dresser: Dresser, cloth: tuple[Array, ...]) -> Clothed:
+    finite = [jnp.all(jnp.isfinite(x), axis=(-2, -1)) for x in cloth]
+    names = (w.name for w in dresser.worn)
+    return Clothed(dict(zip(names, cloth, strict=True)), functools.reduce(jnp.logical_and, finite))
+
+
+def _check_pose(body: Body, rotations: Array, root: Array, axes: tuple[str, ...]) -> None:
+    """Checks shapes only, which works under `jax.jit`."""
+    batch = rotations.shape[: len(axes)]
+    wanted = (*batch, len(body.parents), 4), (*batch, 3)
+    got = rotations.shape, root.shape
+    if got != wanted or rotations.ndim != len(axes) + 2:
+        names = ", ".join((*axes, "joints", "4"))
+        raise ValueError(
+            f"rotations [{names}] have shape {got[0]} and root {got[1]}; the body has"
+            f" {len(body.parents)} joints, so {wanted[0]} and {wanted[1]} are expected. Retarget a"
+            " motion of another skeleton (load_motion), or add the frame axis."
+        )
+
+
+def clothe(
+    dresser: Dresser,
+    rotations: Float[Array, "frames joints 4"],
+    root: Float[Array, "frames 3"],
+    fps: float,
+) -> Clothed:
+    """Computes garments in successive frames; pure, for `jax.jit`, `jax.vmap`, `jax.grad`.
+
+    Poses before frame 0 are extrapolated at constant velocity, see `extrapolate_history`.
+
+    Args:
+        dresser: From `make_dresser`.
+        rotations: Joint rotations relative to their parents, unit quaternions wxyz, as in
+            `Motion`.
+        root: Position of the root joint [m].
+        fps: Frames per second; static under `jax.jit`.
+
+    Returns:
+        Vertices of each garment, and which frames are finite.
+
+    Raises:
+        ValueError: The clip has no frames, or its skeleton isn't the body's.
+
+    Example:
+        >>> from physxnet_jax.dressing import make_dresser
+        >>> from physxnet_jax.motion import load_motion
+        >>> motion = load_motion("walk", fps=30)
+        >>> cloth = jax.jit(clothe, static_argnames="fps")(
+        ...     make_dresser(["bottom"]), motion.rotations[:2], motion.root[:2], fps=30.0
+        ... )
+        >>> cloth["bottom"].shape
+        (2, 2726, 3)
+    """
+    _check_pose(dresser.body, rotations, root, ("frames",))
+    if rotations.shape[0] == 0:
+        raise ValueError("the clip has no frames; clothe needs at least one.")
+    history = extrapolate_history(rotations, root, dresser.history_length)
+    joints = (jnp.concatenate(pair) for pair in zip(history, (rotations, root), strict=True))
+    transforms = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*joints)
+    return _make_clothed(dresser, infer(dresser, *transforms, fps)[1])
+
+
+def init_stream(
+    dresser: Dresser,
+    rotations: Float[Array, "joints 4"] | Float[Array, "frames joints 4"],
+    root: Float[Array, "3"] | Float[Array, "frames 3"],
+) -> Stream:
+    """Makes the state before the first frame of `clothe_step`.
+
+    Args:
+        dresser: From `make_dresser`.
+        rotations: Joint rotations of the first frame, which assumes a static pose before
+            it; or of the first frames (two are enough), whose motion is extrapolated
+            backwards as in `clothe`.
+        root: Position of the root joint [m] in the same frames.
+
+    Returns:
+        The stream before the first frame.
+
+    Raises:
+        ValueError: The skeleton isn't the body's, or there is no pose.
+    """
+    if rotations.ndim == 2:
+        rotations, root = rotations[None], root[None]
+    _check_pose(dresser.body, rotations, root, ("frames",))
+    if not rotations.shape[0]:
+        raise ValueError("no pose: pass the first one or two.")
+    if dresser.predictor is None:
+        return Stream(points=None)
+    texels = dresser.predictor.texel_points
+    history = extrapolate_history(rotations, root, dresser.history_length)
+
+    def points(q: Array, p: Array) -> Array:
+        return skin_points(
+            texels.rest, texels.weights, *dresser.body.transforms(dresser.rest, q, p)
+        )[0]
+
+    return Stream(points=jax.vmap(points)(*history))
+
+
+def clothe_step(
+    dresser: Dresser,
+    stream: Stream,
+    rotations: Float[Array, "joints 4"],
+    root: Float[Array, "3"],
+    fps: float,
+) -> tuple[Stream, Clothed]:
+    """Computes the garments of the next frame; equivalent to `clothe` of the whole clip.
+
+    Each pose is skinned once, whatever the window length. Under `jax.jit` make ``fps``
+    static and donate ``stream``.
+
+    Args:
+        dresser: From `make_dresser`.
+        stream: From `init_stream` or the previous frame.
+        rotations: Joint rotations of this frame.
+        root: Position of the root joint [m].
+        fps: Frames per second.
+
+    Returns:
+        The stream for the next frame, and the garments of this one.
+
+    Raises:
+        ValueError: The skeleton isn't the body's.
+
+    Example:
+        >>> step = jax.jit(clothe_step, static_argnames="fps", donate_argnames="stream")
+    """
+    _check_pose(dresser.body, rotations, root, ())
+    r, t = dresser.body.transforms(dresser.rest, rotations, root)
+    stream, cloth = _predict_step(dresser, stream, r, t, fps)
+    cloth = limit(dresser, cloth, r[None], t[None])
+    cloth = resolve(dresser, cloth, r[None], t[None])
+    return stream, _make_clothed(dresser, tuple(x[0] for x in cloth))
+
+
+def _predict_step(
+    dresser: Dresser,
+    stream: Stream,
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+    fps: float,
+) -> tuple[Stream, Cloth]:
+    """`predict_cloth` for one frame, from the texel points of the previous frames."""
+    predictor = dresser.predictor
+    if predictor is None or stream.points is None:
+        return stream, predict_cloth(dresser, rotations[None], translations[None], fps)
+    texels, inputs = predictor.texel_points, predictor.config.inputs
+    points, blend = skin_points(texels.rest, texels.weights, rotations, translations)
+    window = jnp.concatenate([stream.points, points[None]])
+    features = point_features(window, blend[None], fps, inputs)
+    features = normalise(features, predictor.normalisation, inputs)
+    worn = bound(dresser)
+    offsets = predictor.from_features(features, tuple(dict.fromkeys(w.template for w in worn)))
+    cloth = (
+        apply_sampled_offsets(
+            w,
+            rotations,
+            translations,
+            w.sample(offsets[w.template][0]),
+            predictor.config.family,
+        )[None]
+        for w in worn
+    )
+    return Stream(points=window[1:]), tuple(cloth)

@@ -1,0 +1,333 @@
+"""Inspects garment files: their properties, problems and the command that repairs them."""
+
+import contextlib
+import dataclasses
+import pathlib
+import shlex
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from ..body import Body, load_body
+from ..errors import MeshError
+from ..garment import (
+    ELSEWHERE,
+    HANGS,
+    LONG,
+    NEAREST,
+    TEMPLATES,
+    Garment,
+    MeshHealth,
+    Template,
+    align_to_template,
+    clearance,
+    guess_template,
+    hangs_off,
+    load_garment,
+    locate_on_body,
+    mesh_health,
+    template,
+)
+from ..geometry import TriMesh, make_mesh
+from ..io import StaticMesh, mesh_name, read_mesh
+from ..uv import bind, garment_map_rows, make_atlas
+
+# Share of vertices inside [1], median edge [m] and share of missing rays [1] worth reporting.
+_INSIDE, _FINE, _MAX_MISSED = 0.02, 0.003, 0.1
+# Smallest extent of a garment [m], and largest number of meshes of a file to examine.
+_MIN_EXTENT, _MAX_PARTS = 0.25, 20
+# A better placement has to bring a garment nearer to the skin by this factor; below this hit
+# rate, a garment far from the skin may be misplaced [1].
+_DISTANCE_RATIO, _MIN_HIT_RATE = 0.85, 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Inspection:
+    """Result of inspecting a garment file.
+
+    Attributes:
+        path: The file.
+        unit: Its unit; None if no unit and up axis places it on the body.
+        up: Its up axis, likewise.
+        size: Its extent along its own axes, in its own unit.
+        health: Statistics of the mesh in metres, or in its own unit if `unit` is None.
+        polygons: Number of faces before triangulation.
+        distance: Median distance to the skin [m].
+        farthest: Largest distance to the skin [m].
+        hangs: Smallest distance of its highest tenth from the skin [m]; a garment that rests
+            on shoulders or hips touches the skin there.
+        inside: Share of vertices inside the body or within 3 mm of it.
+        outward: Share of faces whose normals point away from the body.
+        template: Template that dresses it, guessed from what it covers.
+        apart: Distance from each template on the body [m]: the mean distance from vertices of
+            one mesh to the nearest of the other, the larger of both directions.
+        hit_rate: Share of vertices whose ray meets the body.
+        problems: Problems, a sentence each.
+        notes: Remarks that need no action.
+        command: The command that repairs it; None if nothing has to be done.
+    """
+
+    path: pathlib.Path
+    unit: str | None
+    up: str | None
+    size: tuple[float, ...]
+    health: MeshHealth
+    polygons: int
+    distance: float
+    farthest: float
+    hangs: float
+    inside: float
+    outward: float
+    template: Template | None
+    apart: dict[Template, float]
+    hit_rate: float
+    problems: tuple[str, ...]
+    notes: tuple[str, ...]
+    command: str | None
+
+    @property
+    def verdict(self) -> str:
+        """``ready``, or the next step."""
+        if not self.problems:
+            return "ready: it can be worn as it is."
+        several = (self.command or "").startswith("physxnet inspect")
+        return f"{'inspect each' if several else 'repair it first'}: {self.command}"
+
+
+def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> Inspection:
+    """Inspects a garment file without changing it.
+
+    Args:
+        path: A file that `read_mesh` reads.
+        body: The body; the built-in one by default.
+
+    Returns:
+        The findings, and the command that repairs it.
+
+    Raises:
+        FormatError: The file can't be read.
+    """
+    path = pathlib.Path(path)
+    body = load_body() if body is None else body
+    raw = read_mesh(path)
+    skin = body.rest_mesh()
+    try:
+        v, unit, up, posed = locate_on_body(path, raw.vertices, body, raw.faces)
+    except MeshError as error:
+        return _misplaced(path, raw, skin, str(error).partition(": ")[2])
+    mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
+    health = mesh_health(mesh)
+    distance, _ = clearance(skin, np.asarray(v, np.float32))
+    inside = float(np.mean(distance < NEAREST))
+    hangs = hangs_off(v, distance)
+    corner = np.asarray(v)[raw.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    _, away = clearance(skin, corner.mean(axis=1).astype(np.float32))
+    outward = float(np.mean(np.einsum("fi,fi->f", normal, away) > 0))
+    garment, _ = load_garment(path, body=body)
+    hit_rate = _hit_rate(body, garment)
+    found = _Findings([], [], [])
+    _report_mesh(found, health, outward)
+    _report_placement(found, raw, distance, inside, hit_rate, skin)
+    _report_size(found, health, hangs)
+    outfit = _report_parts(found, path, raw, body)
+    _report_images(found, raw)
+    if posed:
+        found.notes.append(
+            "modelled in a T-pose; worn as it is, its sleeves are turned down with the arms."
+        )
+    if health.components > 1:
+        found.notes.append(f"{health.components} disconnected parts: each moves independently.")
+    if hit_rate < 1 - _MAX_MISSED:
+        found.notes.append(
+            f"{100 * (1 - hit_rate):.0f} % of the vertices' rays miss the body; these vertices are"
+            " bound to the closest skin."
+        )
+    return Inspection(
+        path,
+        unit,
+        up,
+        _size(raw),
+        health,
+        raw.count,
+        float(np.median(np.abs(distance))),
+        float(distance.max()),
+        hangs,
+        inside,
+        outward,
+        garment.template,
+        _template_distances(v),
+        hit_rate,
+        tuple(found.problems),
+        tuple(found.notes),
+        outfit or (_command(path, found.options) if found.problems else None),
+    )
+
+
+class _Findings(NamedTuple):
+    """Findings about a garment, and the options of ``physxnet fit`` that repair it."""
+
+    problems: list[str]
+    notes: list[str]
+    options: list[str]
+
+
+def _size(raw: StaticMesh) -> tuple[float, ...]:
+    return tuple(float(s) for s in np.ptp(raw.vertices, axis=0))
+
+
+def _misplaced(path: pathlib.Path, raw: StaticMesh, skin: TriMesh, problem: str) -> Inspection:
+    """The inspection of a mesh that no unit and up axis places on the body."""
+    # Suggests the template whose place it fits best; the user may choose another.
+    nearest = min(TEMPLATES, key=lambda t: align_to_template(raw.vertices, template(t), skin)[2])
+    health = mesh_health(make_mesh(raw.vertices, raw.faces, raw.uv, raw.uv_faces))
+    nan = float("nan")
+    command = _command(path, [f"--like {nearest}"])
+    return Inspection(
+        path, None, None, _size(raw), health, raw.count, nan, nan, nan, nan, nan, None, {}, nan,
+        (problem,), (), command,
+    )  # fmt: skip
+
+
+def _report_mesh(found: _Findings, health: MeshHealth, outward: float) -> None:
+    counts = (
+        (health.coincident_vertices, "vertices that coincide with another one: cloth tears there"),
+        (health.degenerate_faces, "faces of zero area"),
+        (health.duplicate_faces, "faces that occur twice"),
+        (health.unused_vertices, "vertices that no face uses"),
+        (health.inconsistent_edges, "edges whose faces have inconsistent winding"),
+    )
+    found.problems.extend(f"{n:,} {what}." for n, what in counts if n)
+    if outward < 0.5:
+        found.problems.append(
+            f"its faces point inwards ({100 * outward:.0f} % point away from the body)."
+        )
+    if health.non_manifold_edges:
+        found.notes.append(
+            f"{health.non_manifold_edges:,} edges have more than two faces; they are kept, and bend"
+            " without resistance."
+        )
+
+
+def _report_placement(
+    found: _Findings,
+    raw: StaticMesh,
+    distance: np.ndarray,
+    inside: float,
+    hit_rate: float,
+    skin: TriMesh,
+) -> None:
+    if inside > _INSIDE:
+        found.problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
+    loose = hit_rate < _MIN_HIT_RATE and float(np.median(np.abs(distance))) > LONG
+    if inside > ELSEWHERE or loose:
+        # It may be reversed or misplaced: lifting it out of the body would ruin it.
+        better = _better_placement(raw.vertices, distance, skin)
+        if better is not None:
+            name, description = better
+            found.problems.append(f"it lies or faces elsewhere than a {name}: {description}")
+            found.options.append(f"--like {name}")
+
+
+def _report_size(found: _Findings, health: MeshHealth, hangs: float) -> None:
+    if hangs > HANGS:
+        found.problems.append(
+            f"its top stays {1e3 * hangs:.0f} mm off the skin, where nothing holds it up."
+        )
+        found.options.append("--drape")
+    if health.longest_edge > LONG:
+        found.problems.append(
+            f"edges up to {1e3 * health.longest_edge:.0f} mm: too long to fold, and they cut"
+            " through limbs."
+        )
+        found.options.append("--edge-length 20")
+    elif health.median_edge < _FINE:
+        found.notes.append(
+            f"edges of {1e3 * health.median_edge:.1f} mm: finer than any map; `physxnet fit"
+            " --decimate 8` would make it faster."
+        )
+
+
+def _report_parts(found: _Findings, path: pathlib.Path, raw: StaticMesh, body: Body) -> str | None:
+    """Reports the meshes of a file; returns the command that inspects each, if needed."""
+    if len(raw.parts) < 2:
+        return None
+    kinds = _kinds(path, raw.parts, body)
+    if len(set(kinds.values())) > 1:
+        description = ", ".join(f"{name} is dressed by {kind}" for name, kind in kinds.items())
+        found.problems.append(
+            f"it contains several garments, which are worn separately: {description}."
+        )
+        return f"physxnet inspect {' '.join(shlex.quote(f'{path}#{name}') for name in kinds)}"
+    found.notes.append(
+        f"made of {len(raw.parts)} meshes ({', '.join(raw.parts)[:200]}): `{path}#NAME`"
+        " selects one of them."
+    )
+    return None
+
+
+def _report_images(found: _Findings, raw: StaticMesh) -> None:
+    looks = () if raw.polygons is None else raw.polygons.materials
+    images = [m.texture for m in looks if m.texture is not None]
+    lost = sorted({t.name for t in images if t.data is None})
+    if lost:
+        found.notes.append(
+            f"images that can't be used: {', '.join(lost)[:200]}. Only PNG and JPEG in the file's"
+            " folder are read."
+        )
+    elif images and raw.uv is None:
+        found.notes.append("its images can't be used: faces have no texture coordinates.")
+
+
+def _kinds(path: pathlib.Path, parts: tuple[str, ...], body: Body) -> dict[str, Template]:
+    """Template of each mesh of a file that is large enough and on the body."""
+    found: dict[str, Template] = {}
+    for name in parts[:_MAX_PARTS]:
+        mesh = read_mesh(f"{path}#{name}")
+        with contextlib.suppress(MeshError):
+            v, *_ = locate_on_body(path, mesh.vertices, body, mesh.faces)
+            if np.ptp(v, axis=0).max() > _MIN_EXTENT:
+                found[name] = guess_template(v, mesh.faces)
+    return found
+
+
+def _better_placement(
+    vertices: np.ndarray, distance: np.ndarray, skin: TriMesh
+) -> tuple[Template, str] | None:
+    """A template whose place a garment fits better than its own, and how; None if there is none."""
+    placements = {name: align_to_template(vertices, template(name), skin) for name in TEMPLATES}
+    name: Template = min(TEMPLATES, key=lambda n: placements[n][2])
+    placed, description, _ = placements[name]
+    there, _ = clearance(skin, np.asarray(placed, np.float32))
+    now, then = (float(np.mean(x < NEAREST)) for x in (distance, there))
+    nearer = float(np.mean(np.abs(there))) < _DISTANCE_RATIO * float(np.mean(np.abs(distance)))
+    better = then <= max(0.7 * now, _INSIDE) if nearer else then <= 0.25 * now and now > ELSEWHERE
+    if not better:
+        return None
+    return (
+        name,
+        f"{description.rstrip('.')}, there {100 * then:.1f} % of its vertices are in the body.",
+    )
+
+
+def _template_distances(vertices: np.ndarray) -> dict[Template, float]:
+    out: dict[Template, float] = {}
+    for name in TEMPLATES:
+        other = np.asarray(template(name).mesh.vertices)
+        ways = ((vertices, other), (other, vertices))
+        out[name] = max(float(KDTree(a).query(b)[0].mean()) for a, b in ways)
+    return out
+
+
+def _hit_rate(body: Body, garment: Garment) -> float:
+    rest = body.rest_vertices(body.default_shape())
+    atlas = make_atlas(32)
+    valid = garment_map_rows(atlas, body, rest, template(garment.template)).valid
+    return float(bind(garment, atlas=atlas, body=body, rest=rest, valid=valid).hit_rate)
+
+
+def _command(path: pathlib.Path, options: list[str]) -> str:
+    out = path.with_name(f"{mesh_name(path)}_fitted.obj")
+    words = ["physxnet", "fit", shlex.quote(str(path)), *options, "-o", shlex.quote(str(out))]
+    return " ".join(words)

@@ -1,0 +1,177 @@
+"""Simulation of garments, as an alternative to prediction."""
+
+import dataclasses
+import pathlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Literal, cast
+
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..body import Body
+from ..errors import FormatError
+from ..garment import Garment
+from ..motion import Motion
+from ..simulation import (
+    EFFECTS,
+    PRESETS,
+    ROLLOUT_BLOCK,
+    Effect,
+    Implicit,
+    Rollout,
+    Scene,
+    prepare_scene,
+    simulate_batch,
+    standard_effects,
+)
+from ..simulation.blender import simulate_blender
+from ..simulation.effects import Air, Damping, SelfContact
+from ..simulation.newton import simulate_newton
+from ._stages import Stage
+from .postprocess import layer_order
+
+EXTERNAL_ENGINES: dict[str, Callable[..., Rollout]] = {
+    "blender": simulate_blender,
+    "newton": simulate_newton,
+}
+"""Simulators that run out of process."""
+_Progress = Callable[[str, int, int], None]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Simulation:
+    """Options of the cloth simulator.
+
+    Attributes:
+        accuracy: ``draft``, ``standard`` or ``fine``.
+        engine: ``xpbd``; ``bdf2`` (implicit, second order); ``blender`` or ``newton``, which
+            run out of process (PHYSXNET_BLENDER, PHYSXNET_NEWTON).
+        wind: Steady wind [m/s].
+        self_contact: Whether garments collide with themselves.
+        effects: Effects that replace the standard ones.
+        resume: Folder that keeps finished blocks until the simulation completes.
+    """
+
+    accuracy: Literal["draft", "standard", "fine"] = "standard"
+    engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
+    wind: tuple[float, float, float] | None = None
+    self_contact: bool = False
+    effects: tuple[Effect, ...] | None = None
+    resume: pathlib.Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.accuracy not in PRESETS:
+            raise FormatError(f"No accuracy '{self.accuracy}'; there are {', '.join(PRESETS)}.")
+        options = {
+            "--accuracy": self.accuracy != "standard",
+            "--wind": self.wind is not None,
+            "--self-contact": self.self_contact,
+        }
+        given = [name for name, is_set in options.items() if is_set]
+        if self.engine in EXTERNAL_ENGINES and given:
+            raise FormatError(
+                f"--engine {self.engine} defines its own forces, contact and accuracy: leave"
+                f" {', '.join(given)} out."
+            )
+        if self.engine == "bdf2" and options["--accuracy"]:
+            raise FormatError("--accuracy applies to xpbd only: leave it out, or --engine bdf2.")
+
+    @property
+    def also(self) -> tuple[Effect, ...]:
+        """Effects requested in addition to the others."""
+        wind = () if self.wind is None else (Air(wind=self.wind),)
+        return (*wind, *((SelfContact(),) if self.self_contact else ()))
+
+
+def build_scene(
+    garments: Sequence[Garment],
+    body: Body | None,
+    shape: Float[Array, " shapes"] | None,
+    simulation: Simulation,
+    also: Sequence[Effect] = (),
+) -> Scene:
+    """Makes a scene of garments in layer order, with the effects that act on them.
+
+    Args:
+        garments: The garments.
+        body: The body; the built-in one if None.
+        shape: Shape parameters; the default shape if None.
+        simulation: Defines the effects; `standard_effects` if its effects are None.
+        also: Additional effects; each replaces an effect of the same type.
+    """
+    ordered = layer_order(garments)
+    return Scene(tuple(ordered), _active_effects(simulation, len(ordered), also), body, shape)
+
+
+def _active_effects(
+    simulation: Simulation, garments: int, also: Sequence[Effect] = ()
+) -> tuple[Effect, ...]:
+    also = (*simulation.also, *also)
+    if simulation.effects is not None:
+        return _merge_effects(simulation.effects, also)
+    acting = standard_effects(garments)
+    if any(isinstance(e, Air) for e in also):
+        # Damping models still air, so air would act twice with both.
+        acting = tuple(e for e in acting if not isinstance(e, Damping))
+    return _merge_effects(acting, also)
+
+
+def run_simulation(
+    scene: Scene,
+    motion: Motion,
+    simulation: Simulation,
+    *,
+    progress: _Progress | None = None,
+    stages: list[Stage] | None = None,
+) -> Rollout:
+    """Simulates a scene through a motion.
+
+    Args:
+        scene: Garments and effects.
+        motion: The body's motion.
+        simulation: Engine and accuracy; its effects aren't used, those of the scene act.
+        progress: Called with the stage, the frames done and the total number of frames.
+        stages: List to which the time of the simulation is appended.
+
+    Raises:
+        SimulationError: The cloth isn't finite.
+    """
+    ticks, done = [time.perf_counter()], [0]
+
+    def tick(frames: int, total: int) -> None:
+        ticks.append(time.perf_counter())
+        done.append(frames)
+        if progress is not None:
+            progress("simulation", frames, total)
+
+    if simulation.engine in EXTERNAL_ENGINES:
+        rollout = EXTERNAL_ENGINES[simulation.engine](scene, motion, progress=tick)
+    else:
+        bdf2 = simulation.engine == "bdf2"
+        solver = (Implicit(16, 4) if bdf2 else PRESETS[simulation.accuracy]).at_rate(motion.fps)
+        rollout = simulate_batch(
+            prepare_scene(scene), [motion], solver=solver, progress=tick, resume=simulation.resume
+        )[0]
+    rollout.check()
+    if stages is not None:
+        durations = 1e3 * np.diff(ticks)
+        warm = float(np.median(durations[1:])) / ROLLOUT_BLOCK if len(durations) > 1 else None
+        stages.append(Stage("simulation", float(durations[0]) if len(durations) else 0.0, warm))
+    return cast(Rollout, rollout)
+
+
+def _merge_effects(effects: Sequence[Effect], also: Sequence[Effect]) -> tuple[Effect, ...]:
+    """Merges effects in the order of `EFFECTS`; custom effects precede self-contact."""
+    rank = {kind: k for k, kind in enumerate(EFFECTS.values())}
+    custom = rank[SelfContact] - 0.5
+    new = {type(e) for e in also}
+    others = [e for e in effects if type(e) not in new]
+    return tuple(sorted((*others, *also), key=lambda e: rank.get(type(e), custom)))
+
+
+def acting_effects(simulation: Simulation, garments: int) -> tuple[str, ...]:
+    """Names of the effects of a simulation; empty for an external engine."""
+    if simulation.engine in EXTERNAL_ENGINES:
+        return ()
+    return tuple(type(e).__name__ for e in _active_effects(simulation, garments))

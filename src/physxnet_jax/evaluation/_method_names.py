@@ -1,0 +1,79 @@
+"""Names of methods in rows of tables; no other module interprets their suffixes."""
+
+import pathlib
+
+from ..dressing import EXTERNAL_ENGINES, Inference
+from ..models import load_predictor
+from ..simulation import PRESETS
+from ._methods import PERTURBATION, Method, Simulator, external_engine, network, skinning
+
+MIRROR, RELAX, PUSH = "+mirror", "+relax", "+push"
+"""Suffixes of rows: test-time augmentation, strain limiting, collision resolution."""
+
+
+def parse_method(name: str) -> Inference:
+    """The options of a network's row: ``WEIGHTS[+mirror][+relax][+push]``.
+
+    Args:
+        name: Name or folder of weights or of a run, with its suffixes.
+
+    Example:
+        >>> parse_method("nano+mirror+push")
+        Inference(weights='nano', tta=True, strain_iterations=0, collisions=True)
+    """
+    found = []
+    for suffix in (PUSH, RELAX, MIRROR):
+        if name.endswith(suffix):
+            name = name.removesuffix(suffix)
+            found.append(suffix)
+    run = pathlib.Path(name) / "weights"
+    return Inference(
+        weights=str(run) if run.is_dir() else name,
+        tta=MIRROR in found,
+        strain_iterations=Inference().strain_iterations if RELAX in found else 0,
+        collisions=PUSH in found,
+    )
+
+
+def method_name(inference: Inference) -> str:
+    """The name of a network's row; `parse_method` reads it.
+
+    Example:
+        >>> method_name(Inference())
+        'local+relax+push'
+    """
+    return "".join(
+        (
+            str(inference.weights),
+            MIRROR if inference.tta else "",
+            RELAX if inference.strain_iterations else "",
+            PUSH if inference.collisions else "",
+        )
+    )
+
+
+def method_by_name(name: str) -> Method:
+    """A method by the name of its row.
+
+    ``perturbed`` is the simulator with a root perturbed by `PERTURBATION`. Its distance to the
+    unperturbed run is the smallest meaningful error.
+
+    Args:
+        name: ``lbs``, ``perturbed``, an accuracy of the simulator, an external engine, or a
+            network as in `parse_method`.
+
+    Raises:
+        WeightsError: There are no such weights.
+    """
+    if name == "lbs":
+        return skinning()
+    if name == "perturbed":
+        return Simulator("standard", moved=PERTURBATION)
+    if name in PRESETS:
+        return Simulator(name)
+    if name in EXTERNAL_ENGINES:
+        return external_engine(name)
+    inference = parse_method(name)
+    # Missing weights are reported before a long computation starts.
+    load_predictor(str(inference.weights))
+    return network(inference)

@@ -1,0 +1,245 @@
+"""Loads meshes as garments: detects unit, up axis and template, and attaches them to the skin."""
+
+import dataclasses
+import pathlib
+import shlex
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..body import Body, load_body
+from ..errors import MeshError, PhysXNetError
+from ..geometry import (
+    TriMesh,
+    boundary_loops,
+    connected_components,
+    make_mesh,
+    manifold_report,
+    mesh_edges,
+)
+from ..io import GARMENT_FORMATS, mesh_name, read_mesh, split_part
+from ._fit import clearance, lift_out
+from ._garment import COTTON, TEMPLATES, Garment, Template
+from ._locate import locate_on_body, nearest_skin
+from ._templates import template
+from ._wear import parse_wear, with_fabric
+
+NEAREST = 0.003
+# Share of vertices inside the body above which a garment may be misplaced [1].
+ELSEWHERE = 0.1
+# Largest distance of the highest tenth from the skin, and longest edge, without a warning [m].
+HANGS, LONG = 0.02, 0.04
+_TOP_SHARE = 0.1
+# Height of the crotch [m], smallest share of vertices [1] and lateral offset [m] of a leg.
+_CROTCH, _LEG_SHARE, _LEG_OFFSET = -0.2, 0.15, 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class GarmentReport:
+    """Report on a loaded garment file.
+
+    Attributes:
+        path: The file, or the template's name.
+        unit: Its unit.
+        up: Its up axis.
+        vertices: Number of vertices.
+        faces: Number of triangles.
+        topology: Counts of boundary, non-manifold and duplicate elements.
+        inside: Share of vertices that lay within 3 mm of the skin or inside it, and
+            were moved out.
+        distance: Median distance to the skin [m].
+        template: Template that dresses it.
+        hangs: Smallest distance of its highest tenth from the skin [m].
+        longest_edge: Length of its longest edge [m].
+        posed: Whether it was modelled in a T-pose and moved to the rest pose.
+    """
+
+    path: str
+    unit: str
+    up: str
+    vertices: int
+    faces: int
+    topology: dict[str, int]
+    inside: float
+    distance: float
+    template: str
+    hangs: float
+    longest_edge: float
+    posed: bool = False
+
+    @property
+    def warning(self) -> str | None:
+        """Defects that will be visible when it is worn, and the remedy; None without any."""
+        found = []
+        if self.inside > ELSEWHERE:
+            found.append(f"{100 * self.inside:.0f} % of it lies in the body or on it")
+        if self.hangs > HANGS:
+            found.append(f"its top stays {1e3 * self.hangs:.0f} mm off the skin")
+        if self.longest_edge > LONG:
+            found.append(f"edges up to {1e3 * self.longest_edge:.0f} mm are too long to fold")
+        if not found:
+            return None
+        file = shlex.quote(self.path)
+        return f"{self.path}: {', '.join(found)}; `physxnet inspect {file}` shows how to repair it."
+
+
+def load_garment(
+    path: str | pathlib.Path,
+    *,
+    body: Body | None = None,
+) -> tuple[Garment, GarmentReport]:
+    """Loads a garment from a file modelled on the body, or a template by name.
+
+    The unit and up axis are those that place the mesh on the body. Vertices inside the skin
+    move to 3 mm outside. Each vertex is attached to the closest skin. Far from the skin,
+    skinning weights are smoothed, so that a skirt isn't torn between the legs.
+
+    Args:
+        path: A file that `read_mesh` reads (``coat.glb#sleeves`` selects one of several
+            meshes), or ``top``, ``bottom`` or ``dress``; options follow a colon, see
+            `parse_wear`.
+        body: The body; the built-in one by default.
+
+    Returns:
+        The garment and a report.
+
+    Raises:
+        MeshError: No unit and up axis places the mesh on the body.
+        FormatError: The file can't be read.
+    """
+    body = load_body() if body is None else body
+    item = parse_wear(path)
+    path, kind = item.name, item.template
+    if item.fabric is not None:
+        plain = f"{path}:as={kind}" if kind else path
+        garment, report = load_garment(plain, body=body)
+        return with_fabric(garment, item.fabric), report
+    if str(path) in TEMPLATES:
+        if kind is not None:
+            raise PhysXNetError(f"{path} is a template: leave 'as' out.")
+        g = template(str(path))  # pyright: ignore[reportArgumentType]
+        v, faces = np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces)
+        # Template meshes lie on the built-in body, whichever body is given.
+        distance, _ = clearance(load_body().rest_mesh(), v)
+        near = distance < NEAREST
+        report = _report(str(path), "m", "Y", v, faces, near, distance, g.template)
+        return g, report
+    path = pathlib.Path(path)
+    if split_part(path)[0].suffix.lower() not in GARMENT_FORMATS:
+        raise MeshError(
+            f"{path}: a garment is one of {', '.join(TEMPLATES)} (append"
+            f" ':as=top' to a file's name to select one) or a"
+            f" file of triangles or quads: {', '.join(GARMENT_FORMATS)}."
+        )
+    raw = read_mesh(path)
+    mesh = body.rest_mesh()
+    v, unit, up, posed = locate_on_body(path, raw.vertices, body, raw.faces)
+    distance, _ = clearance(mesh, v)
+    moved, inside = lift_out(mesh, v, raw.faces, NEAREST)
+    kind = guess_template(moved, raw.faces) if kind is None else kind
+    garment = carried(
+        make_mesh(moved, raw.faces, raw.uv, raw.uv_faces, name=str(path)),
+        kind,
+        mesh_name(path),
+        body,
+    )
+    garment = dataclasses.replace(garment, polygons=raw.polygons)
+    report = _report(str(path), unit, up, v, raw.faces, inside, distance, kind)
+    return garment, dataclasses.replace(report, posed=posed)
+
+
+def _report(
+    path: str,
+    unit: str,
+    up: str,
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    inside: np.ndarray,
+    distance: np.ndarray,
+    kind: Template,
+) -> GarmentReport:
+    ends = vertices[mesh_edges(faces).vertices]
+    return GarmentReport(
+        path,
+        unit,
+        up,
+        len(vertices),
+        len(faces),
+        manifold_report(faces),
+        float(inside.mean()),
+        float(np.median(np.abs(distance))),
+        kind,
+        hangs_off(vertices, distance),
+        float(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max(initial=0.0)),
+    )
+
+
+def hangs_off(
+    vertices: Float[np.ndarray, "vertices 3"], distance: Float[np.ndarray, " vertices"]
+) -> float:
+    """Smallest distance of the highest tenth of a mesh from the skin [m].
+
+    A garment that rests on shoulders or hips touches the skin there.
+    """
+    height = np.asarray(vertices)[:, 1]
+    return float(distance[height >= height.max() - _TOP_SHARE * np.ptp(height)].min())
+
+
+def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
+    """Makes a garment of a mesh on the body by attaching it to the closest skin."""
+    skin = body.rest_mesh()
+    rest = body.rest_vertices(body.default_shape())
+    v, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    points = jnp.asarray(v.astype(np.float32))
+    refs, shares, weights = nearest_skin(skin, body, v, faces)
+    closest = jnp.einsum("vk,vkc->vc", shares, rest[refs], precision=jax.lax.Precision.HIGHEST)
+    pinned = np.zeros(len(v), dtype=bool)
+    loops = boundary_loops(faces)
+    if kind == "bottom" and loops:
+        pinned[max(loops, key=lambda x: v[x, 1].mean())] = True
+    # Vertices that no face uses are pinned: otherwise they would fall out of the scene.
+    pinned[np.setdiff1d(np.arange(len(v)), faces)] = True
+    return Garment(
+        mesh,
+        jnp.asarray(pinned),
+        refs,
+        shares,
+        points - closest,
+        jnp.asarray(weights.astype(np.float32)),
+        COTTON,
+        kind,
+        name,
+    )
+
+
+def guess_template(
+    v: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Template:
+    """Guesses the template from what a mesh covers: above the waist, below the crotch, legs."""
+    upper = float(np.mean(v[:, 1] > 0.15))
+    lower = float(np.mean(v[:, 1] < -0.08))
+    if lower > 0.15 and _has_legs(v, faces):
+        return "bottom"
+    if upper > 0.15 and lower > 0.15:
+        return "dress"
+    if upper >= lower:
+        return "top"
+    low = [x for x in boundary_loops(faces) if v[x, 1].mean() < -0.08 and len(x) > 4]
+    return "bottom" if len(low) >= 2 else "dress"
+
+
+def _has_legs(v: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]) -> bool:
+    """Whether the mesh below the crotch has a part on either side."""
+    low = faces[(v[faces, 1] < _CROTCH).all(axis=1)]
+    if not len(low):
+        return False
+    rows, at = np.unique(low, return_inverse=True)
+    part = connected_components(at.reshape(-1, 3).astype(np.int32), len(rows))
+    sides = [
+        float(v[rows[part == k], 0].mean())
+        for k in np.unique(part)
+        if np.mean(part == k) > _LEG_SHARE
+    ]
+    return bool(sides) and min(sides) < -_LEG_OFFSET and max(sides) > _LEG_OFFSET

@@ -1,0 +1,116 @@
+"""Meshes that readers return and writers take: static and animated."""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from ..geometry import Material, Polygons, Texture
+
+
+@dataclasses.dataclass(frozen=True)
+class AnimatedMesh:
+    """An animated mesh of constant topology.
+
+    Attributes:
+        name: Name of the mesh.
+        positions: Vertex positions [m], Y up, shape [frames, vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        uv: Texture coordinates, shape [uvs, 2]; or None.
+        uv_faces: Corners in ``uv``, shape [faces, 3]; or None.
+        colour: Display colour, linear RGB in [0, 1].
+        polygons: Polygons that the triangles were cut from, with materials; or None.
+    """
+
+    name: str
+    positions: Float[np.ndarray, "frames vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    uv: Float[np.ndarray, "uvs 2"] | None = None
+    uv_faces: Int[np.ndarray, "faces 3"] | None = None
+    colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
+    polygons: Polygons | None = None
+
+    @property
+    def looks(self) -> list["Look"]:
+        """The look of each material, and the mesh's own for faces without one."""
+        p = self.polygons
+        if p is None or not p.materials:
+            return [Look(self.name, self.colour, np.arange(len(self.faces)))]
+        of_face = p.material[p.of_triangle]
+        found = [self._look(m, np.flatnonzero(of_face == k)) for k, m in enumerate(p.materials)]
+        found.append(Look(self.name, self.colour, np.flatnonzero(of_face < 0)))
+        return [look for look in found if len(look.faces)]
+
+    def _look(self, m: Material, faces: Int[np.ndarray, " faces"]) -> "Look":
+        image = m.texture
+        if image is None or image.data is None or self.uv is None or self.uv_faces is None:
+            return Look(m.name, self.colour if m.colour is None else m.colour, faces)
+        return Look(m.name, (1.0, 1.0, 1.0) if m.colour is None else m.colour, faces, image)
+
+
+class Look(NamedTuple):
+    """Appearance of some faces of a mesh.
+
+    Attributes:
+        name: Name of the material.
+        colour: Linear RGB in [0, 1], by which a texture is multiplied.
+        faces: The triangles, shape [faces].
+        texture: Image on these faces; None without one.
+    """
+
+    name: str
+    colour: tuple[float, float, float]
+    faces: Int[np.ndarray, " faces"]
+    texture: Texture | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class StaticMesh:
+    """A triangulated mesh in its file's unit and axes.
+
+    Attributes:
+        vertices: Positions in the file's unit, in the file's order, shape [vertices, 3].
+        faces: Triangles, shape [faces, 3].
+        uv: Texture coordinates, shape [uvs, 2]; None if any face lacks them.
+        uv_faces: Corners in ``uv``, shape [faces, 3]; None likewise.
+        polygons: The faces before triangulation, with materials; None if they can't be
+            recovered from the triangles.
+        count: Number of faces before triangulation.
+        parts: Names of the meshes that it was joined from, if the file names them.
+    """
+
+    vertices: Float[np.ndarray, "vertices 3"]
+    faces: Int[np.ndarray, "faces 3"]
+    uv: Float[np.ndarray, "uvs 2"] | None
+    uv_faces: Int[np.ndarray, "faces 3"] | None
+    polygons: Polygons | None
+    count: int
+    parts: tuple[str, ...] = ()
+
+
+def vertex_velocities(
+    positions: Float[np.ndarray, "frames vertices 3"], fps: float
+) -> Float[np.ndarray, "frames vertices 3"]:
+    """Velocities towards the next frame [m/s]; the last frame repeats those before it.
+
+    Renderers extrapolate a frame's points along them until the next frame.
+    """
+    out = np.zeros_like(positions)
+    if len(positions) > 1:
+        out[:-1] = (positions[1:] - positions[:-1]) * fps
+        out[-1] = out[-2]
+    return out
+
+
+def smooth_normals(
+    positions: Float[np.ndarray, "frames vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> Float[np.ndarray, "frames vertices 3"]:
+    """Area-weighted unit vertex normals of every frame."""
+    out = np.zeros(positions.shape, dtype=np.float32)
+    for k, x in enumerate(positions):
+        n = np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]])
+        for c in range(3):
+            np.add.at(out[k], faces[:, c], n)
+        out[k] /= np.maximum(np.linalg.norm(out[k], axis=1, keepdims=True), 1e-12)
+    return out

@@ -1,0 +1,309 @@
+"""Trained predictors on disk: safetensors and a JSON card, tied to their atlas."""
+
+import dataclasses
+import hashlib
+import importlib.resources
+import json
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from safetensors.numpy import load as load_tensors, save as save_tensors
+
+from ..body import load_body
+from ..errors import WeightsError
+from ..files import atomic_write
+from ..uv import make_atlas
+from ._features import FeatureConfig
+from ._mean import MeanGenerator, average_networks
+from ._networks import Generator
+from ._predictor import (
+    ModelConfig,
+    Normalisation,
+    Predictor,
+    make_generator,
+    make_texel_points,
+)
+
+DEFAULT = "local"
+"""Name of the default weights."""
+_TENSORS, _CARD = "weights.safetensors", "card.json"
+_PACKAGED = pathlib.Path(str(importlib.resources.files(__package__ or "") / "weights"))
+
+
+def save_predictor(
+    folder: str | pathlib.Path,
+    predictor: Predictor,
+    *,
+    name: str,
+    card: dict[str, Any] | None = None,
+) -> None:
+    """Writes a predictor: half-precision weights, masks, and a card.
+
+    Args:
+        folder: Folder for ``weights.safetensors`` and ``card.json``.
+        predictor: The predictor to write.
+        name: Its name.
+        card: Further entries of the card: data, licence, measured table.
+
+    Raises:
+        WeightsError: The predictor can't be saved: its network is an average, its batch norm
+            is folded, or it uses test-time augmentation. Or parameters exceed half precision.
+    """
+    folder = pathlib.Path(folder)
+    network = nnx.merge(predictor.graph, predictor.state)
+    if isinstance(network, MeanGenerator):
+        raise WeightsError(f"{name}: an average of networks isn't saved; save the networks.")
+    custom = None if isinstance(network, Generator) else type(network).__qualname__
+    plain = nnx.eval_shape(lambda: make_generator(predictor.config))
+    same = jax.tree.structure(nnx.state(network)) == jax.tree.structure(nnx.state(plain))
+    if custom is None and not same:
+        raise WeightsError(
+            f"{name}: this network has been folded (as in a dresser); train and save the"
+            " predictor that was loaded, as in examples/05_fine_tune.py."
+        )
+    if predictor.mirror_tta:
+        raise WeightsError(
+            f"{name}: save the predictor without test-time augmentation, and request that with"
+            " Inference(tta=True)."
+        )
+    tensors: dict[str, np.ndarray] = {}
+    leaves = jax.tree.leaves(predictor.state)
+    for parameter, x in zip(_parameters(predictor.state), leaves, strict=True):
+        # Batch statistics stay float32: a variance may exceed the range of float16.
+        kernel = parameter.endswith("kernel")
+        tensors[parameter] = np.asarray(x).astype(np.float16 if kernel else np.float32)
+        if not np.isfinite(tensors[parameter]).all():
+            raise WeightsError(f"{name}: {parameter} isn't finite in half precision.")
+    for t, mask in predictor.texel_points.valid.items():
+        tensors[f"valid_{t}"] = np.packbits(np.asarray(mask))
+    blob = save_tensors(tensors)
+    n = predictor.normalisation
+    info = {
+        "name": name,
+        "model": dataclasses.asdict(predictor.config),
+        "normalisation": {
+            "velocity": float(n.velocity),
+            "acceleration": float(n.acceleration),
+            "offset": {t: float(v) for t, v in n.offset.items()},
+        },
+        "atlas": predictor.atlas.digest(),
+        "sha256": hashlib.sha256(blob).hexdigest(),
+        **({} if custom is None else {"network": custom}),
+        **(card or {}),
+    }
+    for file, data in ((_TENSORS, blob), (_CARD, json.dumps(info, indent=1).encode())):
+        with atomic_write(folder / file) as part:
+            part.write_bytes(data)
+
+
+def save_mean(
+    folder: str | pathlib.Path, parts: Sequence[str], *, card: dict[str, Any] | None = None
+) -> None:
+    """Writes the card of an average of packaged networks; it has no tensors.
+
+    Args:
+        folder: Folder for ``card.json``; its name becomes the name of the average.
+        parts: Names of `list_weights`.
+        card: Further entries of the card: licence, measured table.
+    """
+    folder = pathlib.Path(folder)
+    digest = _digest([read_card(p) for p in parts])
+    info = {"name": folder.name, "mean_of": list(parts), "sha256": digest, **(card or {})}
+    with atomic_write(folder / _CARD) as part:
+        part.write_text(json.dumps(info, indent=1))
+
+
+def _digest(cards: Sequence[dict[str, Any]]) -> str:
+    return hashlib.sha256("".join(c["sha256"] for c in cards).encode()).hexdigest()
+
+
+def list_weights() -> list[str]:
+    """Names of the packaged weights."""
+    if not _PACKAGED.is_dir():
+        return []
+    return sorted(p.name for p in _PACKAGED.iterdir() if (p / _CARD).is_file())
+
+
+def read_card(weights: str | pathlib.Path = DEFAULT) -> dict[str, Any]:
+    """Reads the card of weights, by name or folder.
+
+    Raises:
+        WeightsError: Unknown name or invalid card.
+    """
+    path = _folder(weights) / _CARD
+    try:
+        card = json.loads(path.read_text())
+    except (ValueError, RecursionError) as error:
+        raise WeightsError(f"{path}: not a card ({error}). Reinstall or copy it again.") from None
+    if not isinstance(card, dict):
+        raise WeightsError(f"{path}: not a card. Reinstall or copy it again.")
+    return card
+
+
+def weights_size(weights: str | pathlib.Path = DEFAULT) -> int:
+    """Size of a network's tensors on disk in bytes.
+
+    Raises:
+        WeightsError: Unknown name, invalid card or missing tensors.
+    """
+    folder = _folder(weights)
+    files = [f / _TENSORS for f in _parts(read_card(weights)) or [folder]]
+    if missing := [f for f in files if not f.is_file()]:
+        raise WeightsError(f"{missing[0]}: no such file. Reinstall or copy it again.")
+    return sum(f.stat().st_size for f in files)
+
+
+def load_predictor(
+    weights: str | pathlib.Path = DEFAULT, *, network: nnx.Module | None = None
+) -> Predictor:
+    """Loads a predictor by the name of packaged weights, or from a folder.
+
+    Args:
+        weights: A name of `list_weights`, or a folder that `save_predictor` wrote.
+        network: A module of the same structure, for weights of a custom network.
+
+    Returns:
+        The predictor, on the built-in body's default shape.
+
+    Raises:
+        WeightsError: Unknown name, damaged file, or an atlas other than the one the
+            weights were trained on.
+    """
+    folder = _folder(weights)
+    try:
+        predictor = _load(weights, folder, network)
+    except WeightsError:
+        raise
+    # A damaged card may raise any error, and safetensors has its own exception types.
+    except Exception as error:
+        raise WeightsError(
+            f"{weights}: the card or the tensors are damaged ({type(error).__name__}:"
+            f" {str(error)[:200]}). Reinstall or copy them again."
+        ) from error
+    return predictor
+
+
+def _model(card: dict[str, Any]) -> ModelConfig:
+    return ModelConfig(
+        **{**card, "templates": tuple(card["templates"]), "inputs": FeatureConfig(**card["inputs"])}
+    )
+
+
+def _parts(card: dict[str, Any]) -> list[pathlib.Path]:
+    """Folders of the packaged networks that a card averages; empty for most cards."""
+    members = card.get("mean_of", ())
+    named = members if isinstance(members, list) else []
+    return [_PACKAGED / name for name in named if name in list_weights()]
+
+
+def _load(
+    weights: str | pathlib.Path, folder: pathlib.Path, custom: nnx.Module | None = None
+) -> Predictor:
+    card = json.loads((folder / _CARD).read_text())
+    if "mean_of" in card:
+        parts = _parts(card)
+        members = [json.loads((p / _CARD).read_text()) for p in parts]
+        if _digest(members) != card["sha256"] or any("mean_of" in c for c in members):
+            raise WeightsError(
+                f"{weights}: {', '.join(map(str, card['mean_of']))} aren't the networks of this"
+                " card. Reinstall the package."
+            )
+        return average_networks([_load(p.name, p) for p in parts])
+    blob = (folder / _TENSORS).read_bytes()
+    digest = hashlib.sha256(blob).hexdigest()
+    if digest != card["sha256"]:
+        raise WeightsError(
+            f"{weights}: sha256 is {digest[:12]}…, the card states {card['sha256'][:12]}…;"
+            " the file is damaged. Reinstall or copy it again."
+        )
+    tensors = load_tensors(blob)
+    model = _model(card["model"])
+    inputs = model.inputs
+    sizes = (model.resolution, model.width, inputs.frames, inputs.stride)
+    if not all(type(n) is int and 0 < n <= 1024 for n in sizes):
+        raise WeightsError(
+            f"{weights}: the card declares {model.resolution} texels per side, width"
+            f" {model.width}, {inputs.frames} frames. Copy it again."
+        )
+    # Shapes only: drawing random parameters that are replaced right away takes seconds.
+    if custom is None and "network" in card:
+        raise WeightsError(
+            f"{weights}: weights of the custom network {card['network']}; pass one as"
+            " load_predictor(..., network=...), and the predictor as weights."
+        )
+    network: Any = nnx.eval_shape(lambda: make_generator(model)) if custom is None else custom
+    network.eval()
+    graph, state = nnx.split(network)
+    # The tensors must be concrete arrays, even inside a traced function.
+    with jax.ensure_compile_time_eval():
+        return _filled(weights, card, model, tensors, graph, state)
+
+
+def _filled(
+    weights: str | pathlib.Path,
+    card: dict[str, Any],
+    model: ModelConfig,
+    tensors: dict[str, np.ndarray],
+    graph: Any,
+    state: Any,
+) -> Predictor:
+    """Fills a network's structure with the tensors of its file."""
+    atlas = make_atlas(model.resolution)
+    if atlas.digest() != card["atlas"]:
+        raise WeightsError(
+            f"{weights}: trained on atlas {card['atlas']}, this version makes"
+            f" {atlas.digest()}. Use the package version that the weights came with."
+        )
+    like, structure = jax.tree.flatten(state)
+    leaves = []
+    for parameter, y in zip(_parameters(state), like, strict=True):
+        x = tensors.get(parameter)
+        if x is None or x.shape != y.shape:
+            found = "isn't there" if x is None else f"has shape {x.shape}"
+            raise WeightsError(
+                f"{weights}: {parameter} {found}; {y.shape} is expected. Use the package version"
+                " that the weights came with."
+            )
+        leaves.append(x)
+    state = jax.tree.unflatten(
+        structure, [jnp.asarray(x.astype(y.dtype)) for x, y in zip(leaves, like, strict=True)]
+    )
+    valid = {
+        t: jnp.asarray(np.unpackbits(tensors[f"valid_{t}"])[: atlas.num_texels].astype(bool))
+        for t in model.templates
+    }
+    n = card["normalisation"]
+    normalisation = Normalisation(
+        jnp.float32(n["velocity"]),
+        jnp.float32(n["acceleration"]),
+        {t: jnp.float32(v) for t, v in n["offset"].items()},
+    )
+    body = load_body()
+    texel_points = make_texel_points(atlas, body, body.rest_vertices(body.default_shape()), valid)
+    return Predictor(atlas, texel_points, normalisation, state, graph, model)
+
+
+def _parameters(state: Any) -> list[str]:
+    """Parameter names such as ``encoder.layers.0.kernel``, in the order of the network's leaves."""
+    paths = jax.tree_util.tree_leaves_with_path(state)
+    names = [jax.tree_util.keystr(p, simple=True, separator=".") for p, _ in paths]
+    return [n.removesuffix(".value") for n in names]
+
+
+def _folder(weights: str | pathlib.Path) -> pathlib.Path:
+    name = str(weights)
+    path = pathlib.Path(name)
+    if (path / _CARD).is_file():
+        return path
+    packaged = _PACKAGED / name
+    if not (packaged / _CARD).is_file():
+        raise WeightsError(
+            f"No weights '{weights}': neither a folder with {_CARD} nor one of"
+            f" {', '.join(list_weights()) or 'none in this package'}."
+        )
+    return packaged

@@ -1,0 +1,53 @@
+"""``NAME[:key=value,...]``: what is worn, as people write it."""
+
+import pytest
+
+from physxnet_jax.errors import PhysXNetError
+from physxnet_jax.garment import FABRICS, load_garment, parse_wear, template, with_default_fabric
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        ("top", ("top", None, None)),
+        ("coat.obj", ("coat.obj", None, None)),
+        ("coat.obj:as=top,fabric=wool", ("coat.obj", "top", "wool")),
+        ("coat.glb#sleeves:fabric=silk", ("coat.glb#sleeves", None, "silk")),
+        ("C:/coats/coat.obj:as=dress", ("C:/coats/coat.obj", "dress", None)),
+        ("C:/coats/coat.obj", ("C:/coats/coat.obj", None, None)),
+    ],
+)
+def test_words_are_parsed(word, expected):
+    item = parse_wear(word)
+    assert (item.name, item.template, item.fabric) == expected
+
+
+@pytest.mark.parametrize(
+    ("word", "fix"),
+    [
+        ("top:colour=red", "there are as, fabric"),
+        ("a.obj:as=hat", "one of top, bottom, dress"),
+        ("top:fabric=tin", "one of cotton"),
+    ],
+)
+def test_unknown_options_are_refused(word, fix):
+    with pytest.raises(PhysXNetError, match=fix):
+        parse_wear(word)
+
+
+def test_the_default_fabric_applies_where_none_is_named():
+    words = ("top", "a.obj:as=top", "bottom:fabric=wool")
+    assert with_default_fabric(words, None) == words
+    made = with_default_fabric(words, "silk")
+    assert [parse_wear(w).fabric for w in made] == ["silk", "silk", "wool"]
+    assert parse_wear(made[1]).template == "top"
+    with pytest.raises(PhysXNetError, match="there are cotton"):
+        with_default_fabric(words, "tin")
+
+
+def test_a_garment_is_made_of_the_fabric():
+    garment, _ = load_garment("bottom:fabric=silk")
+    assert garment.fabric.density == FABRICS["silk"].density
+    assert garment.fabric.thickness >= template("bottom").fabric.thickness
+    with pytest.raises(PhysXNetError, match="is a template"):
+        load_garment("bottom:as=top")
