@@ -275,7 +275,7 @@ def test_effect_costs_separate_relevant_from_irrelevant_effects(tmp_path, capsys
     advice = {a.effect: a for a in recommend_effects(scene, motion, solver=solver, rows=rows)}
     assert advice["Gravity"].needed and advice["Pin"].needed
     assert not advice["BodyContact"].needed
-    assert not advice["SelfContact"].needed and "never comes nearer" in advice["SelfContact"].why
+    assert not advice["SelfContact"].needed and "never comes within" in advice["SelfContact"].why
 
 
 @pytest.mark.release
