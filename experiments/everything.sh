@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Every dataset, network and number of docs/reproduction.md, which lists the same commands.
+# Every dataset and network of docs/reproduction.md, which lists the same commands and tells
+# which tables are kept results without one.
 # With the environment of `make` on the path (PATH=.venv/bin:$PATH), motion files at hand
 # (PHYSXNET_DATA) and Blender (PHYSXNET_BLENDER). Most commands go on where they were stopped.
 set -euo pipefail

@@ -12,8 +12,8 @@ Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.pn
          unseen.py, bench_peers.py, bench_engines.py, bench_training.py and `physxnet bench
          net`; and
          the measured table in the cards of the packaged weights. Datasets are built by
-         `physxnet dataset build`, weights trained by `physxnet train`, both from
-         experiments/training.toml.
+         `physxnet dataset build` from experiments/datasets.toml, weights trained by
+         `physxnet train` from experiments/training.toml.
 """
 
 import argparse

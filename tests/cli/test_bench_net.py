@@ -13,24 +13,30 @@ from flax import nnx
 
 from physxnet_jax.body import load_body
 from physxnet_jax.cli import main
-from physxnet_jax.cli._bench_net import (
-    _from_json,
-    _narrow_command,
+from physxnet_jax.data import Sequence
+from physxnet_jax.evaluation import (
+    Cost,
+    NetworkBench,
+    cost_points,
+    cost_rows_table,
+    engine_times,
+    machine,
+    mean_errors,
+    noise_floors,
+    present_devices,
+    read_rows,
+    row_json,
+    skinning,
+)
+from physxnet_jax.evaluation._cost import _first_of_each
+from physxnet_jax.evaluation._network_bench import (
+    _narrowed,
     _sort_key,
-    _to_json,
+    _unmeasured,
     _with_errors,
     _with_evaluated,
-    engines,
-    floors,
-    markdown,
-    points,
 )
-from physxnet_jax.cli._experiment_commands import Bench
-from physxnet_jax.cli._machine import machine
-from physxnet_jax.cli._rows import kept_rows, weights_digest
-from physxnet_jax.data import Sequence
-from physxnet_jax.evaluation import Cost, mean_errors, present_devices, skinning
-from physxnet_jax.evaluation._cost import _first_of_each
+from physxnet_jax.evaluation._saved_rows import weights_digest
 from physxnet_jax.garment import TEMPLATES, template
 from physxnet_jax.models import (
     ModelConfig,
@@ -167,9 +173,21 @@ def test_times_option_measures_only_existing_rows():
         Cost("network", "nano", "cpu", batch, g, nan, 1.0, 0.5, 1.0, 9, nan, 0.1, nan, slope)
         for batch, g, slope in ((1, 2, nan), (32, 2, 4.0), (1, 3, nan))
     ]
-    again = _narrow_command(Bench("net", garments=(1,), batches=(8,)), known)
+    again = _narrowed(NetworkBench(garments=(1,), batches=(8,)), known)
     assert (again.garments, again.batches, again.backward) == ((2, 3), (1, 32), True)
-    assert not _narrow_command(Bench("net"), known[:1]).backward
+    assert not _narrowed(NetworkBench(), known[:1]).backward
+
+
+def test_rows_without_requested_gradients_are_measured_again():
+    nan = float("nan")
+    known = [
+        Cost("network", "nano", "cpu", batch, 1, nan, 1.0, 0.5, 1.0, 9, nan, 0.1, nan, gradient)
+        for batch, gradient in ((1, nan), (32, 4.0))
+    ]
+    plan = NetworkBench(garments=(1,))
+    assert list(_unmeasured(plan, known)) == []
+    (again,) = _unmeasured(dataclasses.replace(plan, backward=True), known)
+    assert again.batches == (1,)
 
 
 def test_mean_errors_average_the_finite_actions():
@@ -198,18 +216,20 @@ def test_plots_have_a_panel_per_garment_count_and_a_line_over_sizes():
     rows = [row("lbs", "-", 16, k, 20.0) for k in (1, 2, 3)]
     rows += [row("network", s, b, 3, 10.0) for s in ("small", "large") for b in (1, 32)]
     rows += [row("network", "unknown", 1, 3, nan)]
-    found = points(rows)
+    found = cost_points(rows)
     assert {p[0] for p in found} == {"3 garments"}, "nothing to compare with one or two"
     assert [p[1] for p in found].count("network, live") == 2
     assert {p[1] for p in found} == {"lbs", "network, live", "network, 32 frames"}
     beside = [*rows, row("network", "paper", 1, 3, 30.0)]
-    assert [p[1] for p in points(beside)].count("network, live") == 2, "no line to another family"
+    assert [p[1] for p in cost_points(beside)].count("network, live") == 2, (
+        "no line to another family"
+    )
     low = [dataclasses.replace(r, precision="bfloat16") for r in rows]
-    assert points(low)[-1][1] == "network bfloat16, 32 frames"
-    assert len(points(rows[:3])) == 3, "without networks every number is shown"
+    assert cost_points(low)[-1][1] == "network bfloat16, 32 frames"
+    assert len(cost_points(rows[:3])) == 3, "without networks every number is shown"
     noisy = [*rows, *(row("simulator", s, 1, 3, 6.0) for s in ("draft", "perturbed"))]
-    assert [p[1] for p in points(noisy)].count("simulator") == 1, "noise is a floor, no point"
-    assert floors(noisy) == {"3 garments": 6.0} and floors(rows) == {}
+    assert [p[1] for p in cost_points(noisy)].count("simulator") == 1, "noise is a floor, no point"
+    assert noise_floors(noisy) == {"3 garments": 6.0} and noise_floors(rows) == {}
 
 
 def test_rows_of_another_machine_or_other_weights_are_not_resumed(tmp_path, capsys):
@@ -223,7 +243,7 @@ def test_rows_of_another_machine_or_other_weights_are_not_resumed(tmp_path, caps
         (machine(), 16 * "0", "other weights of that name"),
     ):
         out = tmp_path / "net.json"
-        rows = [_to_json(dataclasses.replace(row, weights=weights))]
+        rows = [row_json(dataclasses.replace(row, weights=weights))]
         out.write_text(json.dumps({"machine": where, "rows": rows}))
         assert main([*words, str(out)]) == 2
         assert says in " ".join(capsys.readouterr().err.split())
@@ -235,7 +255,7 @@ def test_rows_of_another_machine_or_other_weights_are_not_resumed(tmp_path, caps
         {"rows": rows},
     ):
         out.write_text(json.dumps(there))
-        assert [r.weights for r in kept_rows(out, _from_json)] == [16 * "0"]
+        assert [r.weights for r in read_rows(out, Cost)] == [16 * "0"]
 
 
 @pytest.mark.parametrize(
@@ -280,8 +300,8 @@ def test_engines_are_timed_and_plotted_without_an_error():
 
     rows = [row("network", "small", 3, 9.0)]
     rows += [row("engine", "blender", k, nan, ms_per_frame=600.0 * k) for k in (1, 2, 3)]
-    assert engines(rows) == {"3 garments": {"blender (another cloth)": 1800.0}}
-    assert [p[1] for p in points(rows)] == ["network, live"]
+    assert engine_times(rows) == {"3 garments": {"blender (another cloth)": 1800.0}}
+    assert [p[1] for p in cost_points(rows)] == ["network, live"]
     # Whichever was measured first, the table has one order.
     rows += [row("network", "local", 1, 9.0, params=99), row("lbs", "-", 1, 20.0)]
     placed = [r.size for r in sorted(rows, key=_sort_key)]
@@ -302,15 +322,17 @@ def test_rows_of_several_devices_share_one_table():
         for d, ms in (("H100", 0.1), ("cpu", 3.0))
         for b in (1, 32)
     ]
-    table = markdown(rows).splitlines()
+    table = cost_rows_table(rows).splitlines()
     assert table[0].startswith("| method | size | device | garments |")
     assert table[2].startswith("| network | small | H100 | 1 | 1 |")
     assert len({line.count("|") for line in table}) == 1
     # A line of the picture for each; with one device none is named.
-    assert [p[1] for p in points(rows)] == [
+    assert [p[1] for p in cost_points(rows)] == [
         f"network, {way}, {d}" for d in ("H100", "cpu") for way in ("live", "32 frames")
     ]
-    assert "device" not in markdown(rows[:2]) and points(rows[:2])[0][1] == "network, live"
+    assert (
+        "device" not in cost_rows_table(rows[:2]) and cost_points(rows[:2])[0][1] == "network, live"
+    )
 
 
 def test_each_device_kind_is_measured_once():

@@ -123,7 +123,7 @@ def test_times_of_another_process_are_kept(tmp_path):
     other.time_of(profile("lbs", 20.0), ("top",))
     kept = json.loads(path.read_text())
     assert set(kept["times"]["lbs"]) == {"bottom", "top"}
-    assert kept["machine"]["processor"] == processor_name()
+    assert kept["machine"]["cpu"] == processor_name()
 
 
 @pytest.mark.nightly

@@ -205,7 +205,7 @@ def test_retime_measures_only_times():
     one = sequence(frames=6)
     rows = measure({"lbs": skinning(), "other": skinning()}, [one])
     slow = lambda motion, name: Prediction(skinning()(motion, name).positions + 1.0, 77.0)  # noqa: E731
-    again = list(retime({"lbs": slow}, [one], rows))
+    again = list(retime({"lbs": slow}, [one], rows, templates=("bottom",)))
     assert again == [dataclasses.replace(rows[0], ms_per_frame=77.0), rows[1]]
 
 

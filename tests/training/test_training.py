@@ -16,7 +16,7 @@ from physxnet_jax.dressing import Inference
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.evaluation import network, skinning
 from physxnet_jax.garment import template
-from physxnet_jax.models import PAPER, ModelConfig, make_texel_points
+from physxnet_jax.models import PAPER, ModelConfig
 from physxnet_jax.motion import load_motion
 from physxnet_jax.training import (
     TrainConfig,
@@ -34,8 +34,7 @@ from physxnet_jax.training import (
 from physxnet_jax.training._checkpoint import Checkpoints
 from physxnet_jax.training._monitor import EarlyStopping, GanMonitor
 from physxnet_jax.training._problem import TrainState
-from physxnet_jax.training._targets import target_offsets
-from physxnet_jax.uv import garment_map_rows, make_atlas
+from physxnet_jax.training._targets import prepare_targets, target_offsets
 
 CONFIG = TrainConfig(
     model=ModelConfig(resolution=32, width=4, templates=("bottom", "top")),
@@ -367,11 +366,11 @@ def test_checkpoints_after_the_resumed_step_are_deleted(tmp_path):
     state = TrainState(**{f.name: jnp.zeros(()) for f in dataclasses.fields(TrainState)})
     at = lambda n: dataclasses.replace(state, step=jnp.int32(n))  # noqa: E731
     kept = Checkpoints(tmp_path / "best", keep=1)
-    kept.save(at(8), {})
+    kept.save(at(8))
     with pytest.raises(PhysXNetError, match="step 4 wasn't saved"):
-        kept.save(at(4), {})
+        kept.save(at(4))
     kept.forget_after(4)
-    kept.save(at(4), {})
+    kept.save(at(4))
     assert int(kept.latest(at(0)).step) == 4
     for file in (tmp_path / "best/4").rglob("*"):
         if file.is_file() and "state" in str(file.relative_to(tmp_path)):
@@ -483,20 +482,17 @@ def test_gan_monitor_resumes_its_running_means():
 
 def test_paper_family_targets_start_at_the_skin(body, rest):
     """At rest, without an offset: from each texel to the cloth that its ray meets."""
-    atlas, g = make_atlas(32), template("bottom")
-    rows = garment_map_rows(atlas, body, rest, g)
-    surface = make_texel_points(atlas, body, rest, {"bottom": rows.valid})
-    joints = len(body.parents)
-    turns, shifts = jnp.tile(jnp.eye(3), (1, joints, 1, 1)), jnp.zeros((1, joints, 3))
-    worn = g.rest_vertices(rest)
-    valid = np.asarray(rows.valid)
-    common = (rows, worn, g.skin, surface.rest, surface.weights, turns, shifts)
+    _, surface, tables = prepare_targets(ModelConfig(resolution=32, templates=("bottom",)))
+    table, joints = tables["bottom"], len(body.parents)
+    pose = jnp.tile(jnp.eye(3), (1, joints, 1, 1)), jnp.zeros((1, joints, 3))
+    worn = template("bottom").rest_vertices(rest)
+    valid = np.asarray(table.to_cloth.valid)
     for up in (0, 100):  # tenths of a millimetre
         stored = jnp.zeros((1, len(worn), 3), jnp.int16).at[..., 1].set(up)
-        seen = np.asarray(target_offsets(stored, *common, "paper"))[0][valid]
-        wanted = np.asarray(rows @ worn - surface.rest)[valid] + [0.0, 1e-4 * up, 0.0]
+        seen = np.asarray(target_offsets(stored, table, surface, *pose, "paper"))[0][valid]
+        wanted = np.asarray(table.to_cloth @ worn - surface.rest)[valid] + [0.0, 1e-4 * up, 0.0]
         np.testing.assert_allclose(seen, wanted, atol=1e-5)
-        local = np.asarray(target_offsets(stored, *common, "local"))[0][valid]
+        local = np.asarray(target_offsets(stored, table, surface, *pose, "local"))[0][valid]
         np.testing.assert_allclose(local, np.tile([0.0, 1e-4 * up, 0.0], (len(seen), 1)), atol=1e-6)
 
 

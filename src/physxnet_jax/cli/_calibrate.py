@@ -29,7 +29,7 @@ def calibrate(command: Calibrate, console: Console) -> int:
     cost_table = load_cost_table()
     with progress_bars(console) as progress:
         times = measure(cost_table, report=lambda _, k, n: progress("timing", k, n))
-    if command.json:
+    if command.terminal.json:
         profiles = [
             {"method": r.name, "ms_per_frame": times[r.name], "rmse_mm": r.rmse_mm}
             for r in cost_table

@@ -12,7 +12,7 @@ from ._progress import print_json
 def clips(command: Clips, console: Console) -> int:
     """Lists the built-in clips, templates and weights."""
     found = {"clips": list(CLIPS), "templates": TEMPLATES, "weights": list_weights()}
-    if command.json:
+    if command.terminal.json:
         print_json(found)
         return 0
     for name, words in found.items():

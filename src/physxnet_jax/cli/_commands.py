@@ -8,12 +8,15 @@ import tyro
 
 from ._options import (
     BodyOptions,
-    Console,
+    EffectOptions,
     InferenceOptions,
+    JsonTerminal,
     MotionSource,
     Outfit,
     Output,
+    QuietTerminal,
     SimulationOptions,
+    Terminal,
 )
 
 
@@ -44,13 +47,14 @@ class Dress:
     inference: InferenceOptions = dataclasses.field(default_factory=InferenceOptions)
     simulation: SimulationOptions = dataclasses.field(default_factory=SimulationOptions)
     output: Output = dataclasses.field(default_factory=Output)
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)
 class Simulate:
     """Simulate a scene: a motion with garments, or a scene file (TOML).
 
-    An interrupted run resumes where it stopped.
+    With -o or --preview, an interrupted run of xpbd or bdf2 resumes where it stopped.
 
     Examples:
       physxnet simulate walk --wear bottom top -o walk.usdc
@@ -65,6 +69,7 @@ class Simulate:
     person: BodyOptions = dataclasses.field(default_factory=BodyOptions)
     simulation: SimulationOptions = dataclasses.field(default_factory=SimulationOptions)
     output: Output = dataclasses.field(default_factory=Output)
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,8 +91,8 @@ class Effects:
     """Write the rows to this file, as JSON."""
     source: MotionSource = dataclasses.field(default_factory=lambda: MotionSource(frames=20))
     outfit: Outfit = dataclasses.field(default_factory=Outfit)
-    simulation: SimulationOptions = dataclasses.field(default_factory=SimulationOptions)
-    console: Console = dataclasses.field(default_factory=Console)
+    simulation: EffectOptions = dataclasses.field(default_factory=EffectOptions)
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,10 +116,7 @@ class Inspect:
     """The ASF file of AMC files."""
     joint_map: pathlib.Path | None = None
     """TOML file for unknown joint names of the motion files, with lines like Hips = "pelvis"."""
-    json: bool = False
-    """Print JSON instead of tables."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: JsonTerminal = dataclasses.field(default_factory=JsonTerminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,12 +141,7 @@ class Fit:
     """Before edges are split, decimate it to about this edge length [mm]."""
     drape: bool = False
     """Finally settle it on the body under its weight, for straps that don't touch the body."""
-    json: bool = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,12 +162,7 @@ class ExportRest:
     """Templates to write as well, fitted to that shape."""
     shape: tuple[str, ...] = ()
     """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
-    json: bool = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,12 +177,7 @@ class Demo:
     """Output folder."""
     frames: int | None = None
     """Stop after this many frames."""
-    json: bool = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,10 +189,7 @@ class Doctor:
       physxnet doctor --json
     """
 
-    json: bool = False
-    """Print JSON instead of tables."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: JsonTerminal = dataclasses.field(default_factory=JsonTerminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -220,12 +204,7 @@ class Calibrate:
 
     again: bool = False
     """Discard earlier measurements."""
-    json: bool = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -237,10 +216,7 @@ class Clips:
       physxnet clips --json
     """
 
-    json: bool = False
-    """Print JSON instead of tables."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: JsonTerminal = dataclasses.field(default_factory=JsonTerminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -258,7 +234,7 @@ class View:
     """
 
     motion: tyro.conf.Positional[str] = "walk"
-    """A .bvh, .amc, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
+    """A .bvh, .amc, .vrma, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
     method: Literal["network", "lbs", "simulate"] = "network"
     """network, lbs (skinning alone) or simulate."""
     compare: bool = False
@@ -279,10 +255,7 @@ class View:
     """Port to listen on; the next free one if it is in use."""
     browser: bool = True
     """Open the browser."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: QuietTerminal = dataclasses.field(default_factory=QuietTerminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -301,9 +274,4 @@ class Export:
     """Platforms that it will run on."""
     outfit: Outfit = dataclasses.field(default_factory=Outfit)
     inference: InferenceOptions = dataclasses.field(default_factory=InferenceOptions)
-    json: bool = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)

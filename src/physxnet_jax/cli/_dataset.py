@@ -61,7 +61,7 @@ def _build(command: Dataset, console: Console) -> int:
         f" whole dataset); {size / 1e6:.1f} MB, sha256 {digest}",
         highlight=False,
     )
-    if command.json:
+    if command.terminal.json:
         print_json({"sha256": digest, "bytes": size, "simulated": done, "seconds": spent})
     return 0
 
@@ -112,7 +112,7 @@ def _check(command: Dataset, console: Console) -> int:
         table.add_row(f.case, f.quantity, f"{f.bound:g}", f"{f.measured:.3g}")
     console.print(table)
     console.print(f"{len(folders)} actions, {size / 1e6:.1f} MB, sha256 {digest}", highlight=False)
-    if command.json:
+    if command.terminal.json:
         print_json(
             {"sha256": digest, "bytes": size, "rows": [dataclasses.asdict(f) for f in found]}
         )

@@ -28,7 +28,7 @@ _OPTIONAL = {
 _MISSING = "missing"
 
 
-def doctor(console: Console, *, json: bool = False) -> int:
+def doctor(command: Doctor, console: Console) -> int:
     """Prints versions, devices and optional packages; returns 1 if it finds a problem."""
     rows = [("python", f"{platform.python_version()} ({sys.platform}, {platform.machine()})")]
     rows += [(name, _version(name) or _MISSING) for name in _REQUIRED]
@@ -45,7 +45,7 @@ def doctor(console: Console, *, json: bool = False) -> int:
         from ..models import list_weights
 
         rows.append(("weights", ", ".join(list_weights()) or "none"))
-    if json:
+    if command.terminal.json:
         print_json({"version": __version__, "parts": dict(rows), "problem": problem})
         return int(problem is not None)
     table = Table(title=f"physxnet_jax {__version__}", title_justify="left")
@@ -66,8 +66,3 @@ def _version(name: str) -> str | None:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
         return None
-
-
-def run_doctor(command: Doctor, console: Console) -> int:
-    """Prints what is installed; returns 1 if a required package is missing or broken."""
-    return doctor(console, json=command.json)

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from ..body import load_body
 from ..dressing import (
+    EXTERNAL_ENGINES,
     Character,
     DressedClip,
     Inference,
@@ -19,13 +20,12 @@ from ..dressing import (
     load_scene,
 )
 from ..errors import FormatError, PhysXNetError
-from ..garment import parse_wear
 from ..io import check_output, write_clip
 from ..motion import Motion, load_motion
 from ..viewer import check_preview, render_preview
 from ._calibrate import choose
 from ._commands import Demo, Dress, Effects, Simulate
-from ._options import BodyOptions, MotionSource, Outfit, changed, check_body
+from ._options import BodyOptions, MotionSource, Outfit, changed, check_body, check_simulates
 from ._progress import UNWRITTEN, print_json, progress_bars
 from ._shape import parse_shape
 from ._table import closing_table, report, rollout_report, rollout_table
@@ -68,7 +68,7 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
             command.motion, command.source, command.outfit, command.person, options, progress
         )
         clip, written, _ = _run(job, output, pictures, progress)
-    if output.json:
+    if command.terminal.json:
         choice = {} if selected is None else {"picked": selected.summary}
         print_json(report(clip) | choice | {"files": written})
         return 0
@@ -85,14 +85,10 @@ def run_simulate(command: Simulate, console: Console) -> int:
     check_body(command.person, command.source)
     output = command.output
     pictures = [] if output.preview is None else [output.preview]
-    if not output.json:
-        _check_files(output.out, pictures, console)
-    else:
-        _check_files(output.out, pictures, Console(quiet=True))
+    _check_files(output.out, pictures, console)
     first = output.out or output.preview
     resume_folder = None if first is None else first.with_name(f".{first.name}.unfinished")
-    quiet = Console(quiet=True, markup=False) if output.json else console
-    with progress_bars(quiet) as progress:
+    with progress_bars(console) as progress:
         if is_scene_file(command.scene):
             job = _scene_job(command)
         else:
@@ -103,7 +99,7 @@ def run_simulate(command: Simulate, console: Console) -> int:
         simulation = dataclasses.replace(job.simulation, resume=resume_folder)
         job = dataclasses.replace(job, simulation=simulation)
         clip, written, seconds = _run(job, output, pictures, progress)
-    if output.json:
+    if command.terminal.json:
         files = {"notes": [*job.notes, *clip.notes], "files": written}
         print_json(rollout_report(clip, job.simulation, seconds) | files)
         return 0
@@ -122,9 +118,8 @@ def run_demo(command: Demo, console: Console) -> int:
             base.output,
             out=command.out / "demo.usdc",
             preview=command.out / "demo.mp4",
-            quiet=command.quiet,
-            json=command.json,
         ),
+        terminal=command.terminal,
     )
     return run_dress(job, console, still=command.out / "demo.png")
 
@@ -155,14 +150,15 @@ def scene_file(command: Simulate | Effects) -> Any:
 
 def _scene_job(command: Simulate) -> _Job:
     found = scene_file(command)
-    accuracy = command.simulation.accuracy
-    accuracy = found.accuracy if accuracy == Simulation().accuracy else accuracy
-    engine = command.simulation.engine
-    simulation = dataclasses.replace(
-        command.simulation.build(),
-        accuracy=accuracy if engine == "xpbd" else Simulation().accuracy,
-        effects=found.scene.effects,
-    )
+    options = command.simulation
+    simulation = dataclasses.replace(options, accuracy=options.accuracy or found.accuracy).build()
+    if options.engine in EXTERNAL_ENGINES:
+        if found.lists_effects:
+            raise FormatError(
+                f"--engine {options.engine} defines its own forces: {command.scene} lists effects."
+            )
+    else:
+        simulation = dataclasses.replace(simulation, effects=found.scene.effects)
     return _Job(
         motion=found.motion,
         wear=found.scene.garments,
@@ -270,17 +266,10 @@ def _check_method(command: Dress) -> None:
         )
     if command.budget_ms is not None and command.max_error_mm is not None:
         raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
-    if command.method != "simulate" and changed(command.simulation):
-        flag = changed(command.simulation)[0]
-        raise PhysXNetError(f"{flag} is an option of the simulator: add --method simulate.")
-    if command.method != "simulate" and any(parse_wear(w).fabric for w in command.outfit.words):
-        raise PhysXNetError(
-            "--fabric, fabric=: the networks support one fabric. Add --method simulate, or leave"
-            " it out."
-        )
-    of_networks = {"--weights", "--tta", "--strain-iterations"}
-    if command.method != "network" and of_networks & set(changed(command.inference)):
-        raise PhysXNetError(f"--weights are for networks: --method {command.method} has none.")
+    check_simulates(command.method, command.simulation, command.outfit)
+    for flag in changed(command.inference):
+        if command.method != "network" and flag != "--collisions":
+            raise PhysXNetError(f"{flag} is for networks: --method {command.method} has none.")
 
 
 def _print_end(

@@ -27,7 +27,7 @@ def price(command: Effects, console: Console) -> int:
             simulation=command.simulation.build(),
             **dataclasses.asdict(command.source),
         )
-    solver = PRESETS[job.accuracy].at_rate(job.motion.fps)
+    solver = PRESETS[command.simulation.accuracy or job.accuracy].at_rate(job.motion.fps)
     with progress_bars(console) as bars:
         rows = price_effects(
             job.scene, job.motion, solver=solver, progress=lambda d, t: bars("effects", d, t)
@@ -72,6 +72,6 @@ def price(command: Effects, console: Console) -> int:
     }
     if command.out is not None:
         write_json(command.out, data)
-    if command.console.json:
+    if command.terminal.json:
         print_json(data)
     return 0

@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 import tyro
 
+from ._options import QuietTerminal, Terminal
+
 
 @dataclasses.dataclass(frozen=True)
 class Stress:
@@ -23,12 +25,7 @@ class Stress:
     """Other simulators that run the cases they can (PHYSXNET_BLENDER, PHYSXNET_NEWTON)."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Write the rows to this file, as JSON."""
-    json: bool = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,10 +78,7 @@ class Bench:
     """sim: quality settings to run Blender with as well, the finest last."""
     newton: tuple[int, ...] = ()
     """sim: substeps to run Newton with as well, the finest last."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: QuietTerminal = dataclasses.field(default_factory=QuietTerminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,13 +108,7 @@ class Dataset:
     """build: names of the actions to build; all by default."""
     contact_sheet: pathlib.Path | None = None
     """check: a contact sheet, .png."""
-    json: bool = False
-    """Print JSON. check: all findings, instead of a table of those out of bounds. build: checksum,
-    size and time."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,10 +133,7 @@ class Train:
     """Stop after this many steps in total."""
     name: str | None = None
     """Name of the weights; by default the configuration's table or file name."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: QuietTerminal = dataclasses.field(default_factory=QuietTerminal)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,8 +141,8 @@ class Evaluate:
     """Measure the error and the cost of methods on every action of a dataset.
 
     Methods: lbs, nearest, mlp, draft, standard, fine, perturbed, names of weights, folders of
-    weights or of runs; blender and newton, which model another cloth. +push after a network's
-    name enables collision resolution.
+    weights or of runs; blender and newton, which model another cloth. After a network's name,
+    +mirror averages with the mirrored pose, +relax limits strain and +push resolves collisions.
 
     Examples:
       physxnet evaluate local local+push lbs --data runs/ours --out out/errors.json
@@ -179,9 +164,4 @@ class Evaluate:
     Existing rows are kept."""
     times: bool = False
     """Only measure the times of these methods' rows again, in one run."""
-    json: bool = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)

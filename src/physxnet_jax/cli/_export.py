@@ -4,11 +4,13 @@ from rich.console import Console
 
 from ..dressing import export_dresser, make_dresser
 from ._commands import Export
+from ._options import check_one_fabric
 from ._progress import print_json
 
 
 def export(command: Export, console: Console) -> int:
     """Writes the function and prints how to call it."""
+    check_one_fabric(command.outfit, "Leave it out.")
     with console.status("binding and lowering"):
         dresser = make_dresser(command.outfit.words, inference=command.inference.build())
         files = export_dresser(
@@ -18,7 +20,7 @@ def export(command: Export, console: Console) -> int:
             platforms=command.platforms,
             name=str(command.inference.weights),
         )
-    if command.json:
+    if command.terminal.json:
         print_json({"files": files, "notes": dresser.notes})
         return 0
     for note in dresser.notes:

@@ -43,9 +43,9 @@ def inspect(command: Inspect, console: Console) -> int:
             )
         else:
             found.append(inspect_garment(file))
-        if not command.json:
+        if not command.terminal.json:
             _show(found[-1], console)
-    if command.json:
+    if command.terminal.json:
         print_json([_to_json(f) for f in found])
     return int(any(f.problems for f in found))
 
@@ -66,8 +66,7 @@ def fit(command: Fit, console: Console) -> int:
     longest, coarser = (
         None if mm is None else 1e-3 * mm for mm in (command.edge_length, command.decimate)
     )
-    quiet = Console(quiet=True, markup=False) if command.json else console
-    with progress_bars(quiet) as bars:
+    with progress_bars(console) as bars:
         bars("fitting", 0, 1)
         done, result = fit_garment(
             command.file,
@@ -78,7 +77,7 @@ def fit(command: Fit, console: Console) -> int:
             draped=command.drape,
             progress=lambda k, n: bars("settling", k, n),
         )
-    if command.json:
+    if command.terminal.json:
         print_json({"done": done, "result": _to_json(result), "files": [command.out]})
         return int(bool(result.problems))
     for step in done:
@@ -103,9 +102,8 @@ def export_rest(command: ExportRest, console: Console) -> int:
         chart = (None if x is None else np.asarray(x) for x in (mesh.uv, mesh.uv_faces))
         write_obj(path, np.asarray(mesh.vertices), np.asarray(mesh.faces), *chart)
         files.append(path)
-        if not command.json:
-            console.print(f"wrote {path}", highlight=False)
-    if command.json:
+        console.print(f"wrote {path}", highlight=False)
+    if command.terminal.json:
         print_json({"files": files})
     return 0
 

@@ -56,7 +56,7 @@ _COMMANDS: dict[str, _Handler] = {
     "bench": _Handler(Bench, "_bench", "bench", _LEARN),
     "calibrate": _Handler(Calibrate, "_calibrate", "calibrate", _SYSTEM),
     "clips": _Handler(Clips, "_clips", "clips", _SYSTEM),
-    "doctor": _Handler(Doctor, "_doctor", "run_doctor", _SYSTEM),
+    "doctor": _Handler(Doctor, "_doctor", "doctor", _SYSTEM),
 }
 
 
@@ -107,10 +107,9 @@ def print_help(console: Console) -> None:
                 console.print(f"  {name:<12} {line}", soft_wrap=True)
 
 
-def _flag(command: object, name: str) -> bool:
-    """Whether a terminal flag is set on the command or on one of its option groups."""
-    holders = (command, getattr(command, "output", None), getattr(command, "console", None))
-    return any(getattr(h, name, False) is True for h in holders)
+def _flag(command: Any, name: str) -> bool:
+    """Whether a terminal flag is set; not every command has all of them."""
+    return getattr(command.terminal, name, False)
 
 
 def _resumes(command: object) -> bool:
@@ -118,8 +117,10 @@ def _resumes(command: object) -> bool:
     if isinstance(command, Simulate):
         internal = command.simulation.engine in ("xpbd", "bdf2")
         return internal and (command.output.out or command.output.preview) is not None
-    if isinstance(command, Evaluate | Bench | Dataset):
-        return command.out is not None
+    if isinstance(command, Evaluate | Bench):
+        return command.out is not None and not command.times
+    if isinstance(command, Dataset):
+        return command.what == "build"
     return isinstance(command, Train | Calibrate)
 
 

@@ -35,14 +35,12 @@ class InferenceOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class SimulationOptions:
+class EffectOptions:
     """Simulation."""
 
-    accuracy: Literal["draft", "standard", "fine"] = "standard"
-    """Accuracy of the simulation; higher accuracy takes more time."""
-    engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
-    """bdf2: implicit, second order. blender, newton: external processes (PHYSXNET_BLENDER,
-    PHYSXNET_NEWTON)."""
+    accuracy: Literal["draft", "standard", "fine"] | None = None
+    """Accuracy of the simulation; higher accuracy takes more time. By default that of the scene
+    file, else standard."""
     wind: tuple[float, float, float] | None = None
     """Steady wind [m/s]."""
     self_contact: bool = False
@@ -52,7 +50,17 @@ class SimulationOptions:
         """Builds the options of the Python API."""
         from ..dressing import Simulation
 
-        return Simulation(**{f.name: getattr(self, f.name) for f in dataclasses.fields(self)})
+        given = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        return Simulation(**{k: v for k, v in given.items() if v is not None})
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationOptions(EffectOptions):
+    """Simulation."""
+
+    engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
+    """bdf2: implicit, second order. blender, newton: external processes (PHYSXNET_BLENDER,
+    PHYSXNET_NEWTON)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -109,18 +117,6 @@ class BodyOptions:
 
 
 @dataclasses.dataclass(frozen=True)
-class Console:
-    """Terminal."""
-
-    json: bool = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print errors only."""
-    debug: bool = False
-    """Show the traceback of an error."""
-
-
-@dataclasses.dataclass(frozen=True)
 class Output:
     """Output."""
 
@@ -130,12 +126,33 @@ class Output:
     """Image or video: .png, .gif or .mp4."""
     body: bool = True
     """Include the body in the result."""
-    json: bool = False
-    """Print JSON instead of tables."""
-    quiet: bool = False
-    """Print errors only."""
+
+
+@dataclasses.dataclass(frozen=True)
+class _Debug:
     debug: bool = False
     """Show the traceback of an error."""
+
+
+@dataclasses.dataclass(frozen=True)
+class JsonTerminal(_Debug):
+    """Terminal."""
+
+    json: bool = False
+    """Print JSON instead of tables."""
+
+
+@dataclasses.dataclass(frozen=True)
+class QuietTerminal(_Debug):
+    """Terminal."""
+
+    quiet: bool = False
+    """Print errors only."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Terminal(JsonTerminal, QuietTerminal):
+    """Terminal."""
 
 
 def changed(group: Any) -> list[str]:
@@ -173,3 +190,28 @@ def check_body(options: BodyOptions, source: MotionSource) -> None:
         raise PhysXNetError("--character-map names joints of --character: add --character.")
     if source.start and custom:
         raise PhysXNetError("--start cuts motions of the built-in body only: leave it out.")
+
+
+def check_one_fabric(outfit: Outfit, advice: str) -> None:
+    """Checks that no fabric is chosen where the networks' own is the only one.
+
+    Raises:
+        PhysXNetError: One is; the message ends with the advice.
+    """
+    from ..garment import parse_wear
+
+    if any(parse_wear(w).fabric for w in outfit.words):
+        raise PhysXNetError(f"--fabric, fabric=: the networks support one fabric. {advice}")
+
+
+def check_simulates(method: str, simulation: SimulationOptions, outfit: Outfit) -> None:
+    """Checks that options of the simulator are given to the simulator only.
+
+    Raises:
+        PhysXNetError: They aren't.
+    """
+    if method == "simulate":
+        return
+    for flag in changed(simulation):
+        raise PhysXNetError(f"{flag} is an option of the simulator: add --method simulate.")
+    check_one_fabric(outfit, "Add --method simulate, or leave it out.")

@@ -65,6 +65,6 @@ def stress(command: Stress, console: Console) -> int:
     data = [{**dataclasses.asdict(r), "holds": r.holds, **peer_row(r)} for r in rows]
     if command.out is not None:
         write_json(command.out, data)
-    if command.json:
+    if command.terminal.json:
         print_json(data)
     return 0 if all(r.holds for r in rows) else 1

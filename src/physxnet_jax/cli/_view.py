@@ -10,6 +10,7 @@ from ..errors import PhysXNetError
 from ..files import check_writable
 from ..viewer import Choice, Viewer, record
 from ._commands import View
+from ._options import check_simulates
 from ._progress import progress_bars
 from ._shape import parse_shape
 
@@ -30,6 +31,8 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         raise PhysXNetError("--compare is for a --method other than simulate; leave it out.")
     if command.html is not None:
         check_writable(command.html)
+        if not command.compare:
+            check_simulates(command.method, command.simulation, command.outfit)
     source = command.source
     if source.start:
         raise PhysXNetError("--start: the viewer shows motions from their start; leave it out.")
@@ -43,7 +46,7 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         shape=tuple(parse_shape(command.shape).items()),
         simulation=command.simulation.build(),
         fabric=command.outfit.fabric,
-        frames=source.frames or Choice().frames,
+        frames=Choice().frames if source.frames is None else source.frames,
         fps=source.fps,
         source_fps=source.source_fps,
         skeleton=source.skeleton,

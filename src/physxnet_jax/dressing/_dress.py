@@ -27,15 +27,15 @@ from ._dresser import Dresser, dress_garments, move_to_body
 from ._inference import Inference
 from ._meshes import Wear, animated_meshes, resolve_garments
 from ._simulate import Simulation, build_scene, run_simulation
-from ._stages import Stage, Watch
-from .postprocess import prepare_collisions
+from ._stages import Stage, timed
+from .postprocess import make_colliders
 
 Method = Literal["network", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "lbs", "simulate")
 Progress = Callable[[str, int, int], None]
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class DressedClip:
     """A dressed person in motion.
 
@@ -182,7 +182,7 @@ def _load_person(
     stages: list[Stage],
 ) -> _Person:
     character = motion if isinstance(motion, Character) else None
-    with Watch(stages)("motion"):
+    with timed(stages, "motion"):
         if isinstance(motion, Character):
             body, fps, motion = motion.body, motion.fps, motion.motion
         body = load_body() if body is None else body
@@ -197,7 +197,7 @@ def _load_garments(
     wear: Wear, person: _Person, method: Method, stages: list[Stage]
 ) -> tuple[list[Garment], tuple[str, ...]]:
     character = person.character
-    with Watch(stages)("garments"):
+    with timed(stages, "garments"):
         # Garments are modelled on the built-in body, then transferred to the character.
         garments, notes = resolve_garments(wear, person.body if character is None else load_body())
         if character is not None:
@@ -213,10 +213,10 @@ def _make_dresser(
     stages: list[Stage],
 ) -> Dresser:
     if method == "network" and not isinstance(inference.weights, Predictor):
-        with Watch(stages)("weights"):
+        with timed(stages, "weights"):
             weights = load_predictor(inference.weights)
             inference = dataclasses.replace(inference, weights=weights)
-    with Watch(stages)("binding"):
+    with timed(stages, "binding"):
         return dress_garments(
             garments,
             method="network" if method == "network" else "lbs",
@@ -279,7 +279,7 @@ def _assemble_clip(
     """Assembles the result and measures the share of each garment inside the body."""
     character, clip = person.character, person.clip
     positions, worst = cloth.positions, {}
-    with Watch(stages)("body"):
+    with timed(stages, "body"):
         if character is not None:
             raw, positions = dress_character(character, dresser, clip, positions)
             inside_raw, inside = (
@@ -289,7 +289,7 @@ def _assemble_clip(
         else:
             colliders = dresser.colliders
             if colliders is None:
-                colliders = prepare_collisions(dresser.outfit, Inference(collisions=True)) or ()
+                colliders = make_colliders(dresser.outfit)
             inside_raw, inside = {}, {}
             for w, c in zip(dresser.worn, colliders, strict=True):
                 shares = inside_shares(c, positions[w.name], clip)
@@ -306,19 +306,19 @@ def _assemble_clip(
     fault = sudden_turns(person.body, clip.motion)
     bound = {w.name: w.binding if isinstance(w, BoundGarment) else None for w in dresser.worn}
     return DressedClip(
-        meshes,
-        clip.motion.fps,
-        tuple(stages),
-        {n: None if b is None else float(b.hit_rate) for n, b in bound.items()},
-        {n: None if b is None else int(b.fallbacks) for n, b in bound.items()},
-        inside_raw,
-        inside,
-        method,
-        (
+        meshes=meshes,
+        fps=clip.motion.fps,
+        stages=tuple(stages),
+        hit_rate={n: None if b is None else float(b.hit_rate) for n, b in bound.items()},
+        fallbacks={n: None if b is None else int(b.fallbacks) for n, b in bound.items()},
+        inside_raw=inside_raw,
+        inside=inside,
+        method=method,
+        notes=(
             *(() if fault is None else (fault,)),
             *(() if character is None else character.notes),
             *notes,
         ),
-        worst,
-        cloth.rollout,
+        worst=worst,
+        rollout=cloth.rollout,
     )

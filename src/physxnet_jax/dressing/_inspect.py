@@ -42,7 +42,7 @@ _MIN_EXTENT, _MAX_PARTS = 0.25, 20
 _DISTANCE_RATIO, _MIN_HIT_RATE = 0.85, 0.5
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class Inspection:
     """Result of inspecting a garment file.
 
@@ -65,7 +65,9 @@ class Inspection:
         hit_rate: Share of vertices whose ray meets the body.
         problems: Problems, a sentence each.
         notes: Remarks that need no action.
-        command: The command that repairs it; None if nothing has to be done.
+        command: The command that repairs it, or lists the garments of a file with several; None
+            if nothing has to be done.
+        several: Whether the file holds several garments.
     """
 
     path: pathlib.Path
@@ -85,14 +87,14 @@ class Inspection:
     problems: tuple[str, ...]
     notes: tuple[str, ...]
     command: str | None
+    several: bool = False
 
     @property
     def verdict(self) -> str:
         """``ready``, or the next step."""
         if not self.problems:
             return "ready: it can be worn as it is."
-        several = (self.command or "").startswith("physxnet inspect")
-        return f"{'inspect each' if several else 'repair it first'}: {self.command}"
+        return f"{'inspect each' if self.several else 'repair it first'}: {self.command}"
 
 
 def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> Inspection:
@@ -145,23 +147,24 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
             " bound to the closest skin."
         )
     return Inspection(
-        path,
-        unit,
-        up,
-        _size(raw),
-        health,
-        raw.count,
-        float(np.median(np.abs(distance))),
-        float(distance.max()),
-        hangs,
-        inside,
-        outward,
-        garment.template,
-        _template_distances(v),
-        hit_rate,
-        tuple(found.problems),
-        tuple(found.notes),
-        outfit or (_command(path, found.options) if found.problems else None),
+        path=path,
+        unit=unit,
+        up=up,
+        size=_size(raw),
+        health=health,
+        polygons=raw.count,
+        distance=float(np.median(np.abs(distance))),
+        farthest=float(distance.max()),
+        hangs=hangs,
+        inside=inside,
+        outward=outward,
+        template=garment.template,
+        apart=_template_distances(v),
+        hit_rate=hit_rate,
+        problems=tuple(found.problems),
+        notes=tuple(found.notes),
+        command=outfit or (_command(path, found.options) if found.problems else None),
+        several=outfit is not None,
     )
 
 
@@ -183,11 +186,25 @@ def _misplaced(path: pathlib.Path, raw: StaticMesh, skin: TriMesh, problem: str)
     nearest = min(TEMPLATES, key=lambda t: align_to_template(raw.vertices, template(t), skin)[2])
     health = mesh_health(make_mesh(raw.vertices, raw.faces, raw.uv, raw.uv_faces))
     nan = float("nan")
-    command = _command(path, [f"--like {nearest}"])
     return Inspection(
-        path, None, None, _size(raw), health, raw.count, nan, nan, nan, nan, nan, None, {}, nan,
-        (problem,), (), command,
-    )  # fmt: skip
+        path=path,
+        unit=None,
+        up=None,
+        size=_size(raw),
+        health=health,
+        polygons=raw.count,
+        distance=nan,
+        farthest=nan,
+        hangs=nan,
+        inside=nan,
+        outward=nan,
+        template=None,
+        apart={},
+        hit_rate=nan,
+        problems=(problem,),
+        notes=(),
+        command=_command(path, [f"--like {nearest}"]),
+    )
 
 
 def _report_mesh(found: _Findings, health: MeshHealth, outward: float) -> None:

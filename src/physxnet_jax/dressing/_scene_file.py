@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import tomllib
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 from jaxtyping import Array, Float
 
@@ -44,13 +44,15 @@ class SceneFile:
         scene: Garments, effects and shape.
         motion: The body's motion.
         accuracy: ``draft``, ``standard`` or ``fine``.
+        lists_effects: Whether a file lists effects.
         notes: Remarks on the motion and on garments read from files.
     """
 
     scene: Scene
     motion: Motion
-    accuracy: str = "standard"
+    accuracy: Literal["draft", "standard", "fine"] = "standard"
     notes: tuple[str, ...] = ()
+    lists_effects: bool = False
 
 
 def make_scene(
@@ -157,7 +159,11 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         shape=load_body().shape(**text["shape"]) if "shape" in text else None,
         also=_parse_effects(path, text.get("also", {})),
     )
-    return dataclasses.replace(scene_file, notes=(*scene_file.notes, *notes))
+    return dataclasses.replace(
+        scene_file,
+        notes=(*scene_file.notes, *notes),
+        lists_effects="effects" in text or "also" in text,
+    )
 
 
 def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, str]]]:

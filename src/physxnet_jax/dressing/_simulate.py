@@ -16,7 +16,6 @@ from ..motion import Motion
 from ..simulation import (
     EFFECTS,
     PRESETS,
-    ROLLOUT_BLOCK,
     Effect,
     Implicit,
     Rollout,
@@ -64,18 +63,18 @@ class Simulation:
         if self.accuracy not in PRESETS:
             raise FormatError(f"No accuracy '{self.accuracy}'; there are {', '.join(PRESETS)}.")
         options = {
-            "--accuracy": self.accuracy != "standard",
-            "--wind": self.wind is not None,
-            "--self-contact": self.self_contact,
+            "accuracy": self.accuracy != "standard",
+            "wind": self.wind is not None,
+            "self_contact": self.self_contact,
         }
         given = [name for name, is_set in options.items() if is_set]
         if self.engine in EXTERNAL_ENGINES and given:
             raise FormatError(
-                f"--engine {self.engine} defines its own forces, contact and accuracy: leave"
+                f"engine {self.engine} defines its own forces, contact and accuracy: leave"
                 f" {', '.join(given)} out."
             )
-        if self.engine == "bdf2" and options["--accuracy"]:
-            raise FormatError("--accuracy applies to xpbd only: leave it out, or --engine bdf2.")
+        if self.engine == "bdf2" and options["accuracy"]:
+            raise FormatError("accuracy applies to xpbd only: leave it or engine bdf2 out.")
 
     @property
     def also(self) -> tuple[Effect, ...]:
@@ -156,7 +155,9 @@ def run_simulation(
     rollout.check()
     if stages is not None:
         durations = 1e3 * np.diff(ticks)
-        warm = float(np.median(durations[1:])) / ROLLOUT_BLOCK if len(durations) > 1 else None
+        # The first call may report frames that an earlier run finished.
+        per_frame = durations[1:] / np.maximum(np.diff(done)[1:], 1)
+        warm = float(np.median(per_frame)) if len(per_frame) else None
         stages.append(Stage("simulation", float(durations[0]) if len(durations) else 0.0, warm))
     return cast(Rollout, rollout)
 

@@ -1,7 +1,9 @@
 """Timing of stages."""
 
+import contextlib
 import dataclasses
 import time
+from collections.abc import Iterator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,20 +22,9 @@ class Stage:
     warm_ms: float | None = None
 
 
-class Watch:
-    """Records how long each stage takes."""
-
-    def __init__(self, stages: list[Stage]) -> None:
-        self._stages = stages
-        self._name = ""
-        self._start = 0.0
-
-    def __call__(self, name: str) -> "Watch":
-        self._name = name
-        return self
-
-    def __enter__(self) -> None:
-        self._start = time.perf_counter()
-
-    def __exit__(self, *error: object) -> None:
-        self._stages.append(Stage(self._name, 1e3 * (time.perf_counter() - self._start)))
+@contextlib.contextmanager
+def timed(stages: list[Stage], name: str) -> Iterator[None]:
+    """Appends the time of the enclosed stage."""
+    start = time.perf_counter()
+    yield
+    stages.append(Stage(name, 1e3 * (time.perf_counter() - start)))

@@ -22,6 +22,11 @@ from ._cost import (
     other_costs as other_costs,
     present_devices as present_devices,
 )
+from ._cost_points import (
+    cost_points as cost_points,
+    engine_times as engine_times,
+    noise_floors as noise_floors,
+)
 from ._cost_table import (
     ALONE_AND_TOGETHER as ALONE_AND_TOGETHER,
     MethodProfile as MethodProfile,
@@ -34,12 +39,12 @@ from ._cost_table import (
 )
 from ._dataset_check import check_sequence as check_sequence
 from ._evaluate import (
-    DIGITS as DIGITS,
     ActionError as ActionError,
     evaluate as evaluate,
     means as means,
     retime as retime,
 )
+from ._evaluate_dataset import evaluate_dataset as evaluate_dataset
 from ._method_names import (
     MIRROR as MIRROR,
     method_by_name as method_by_name,
@@ -61,12 +66,29 @@ from ._motion_metrics import (
     jitter as jitter,
     wrinkle_error as wrinkle_error,
 )
+from ._network_bench import (
+    NetworkBench as NetworkBench,
+    bench_networks as bench_networks,
+    evaluated_errors as evaluated_errors,
+)
 from ._penetration import penetration as penetration
 from ._price import price_effects as price_effects, recommend_effects as recommend_effects
+from ._saved_rows import (
+    check_rows_file as check_rows_file,
+    machine as machine,
+    read_rows as read_rows,
+    row_json as row_json,
+    save_rows as save_rows,
+)
 from ._strain import edge_strain as edge_strain
 from ._stress import CASES as CASES, Finding as Finding, run_case as run_case
 from ._stress_worn import PEER_CASES as PEER_CASES, run_peer as run_peer
-from ._tables import error_tables as error_tables, summary_table as summary_table
+from ._tables import (
+    cost_rows_table as cost_rows_table,
+    error_tables as error_tables,
+    summary_table as summary_table,
+    work_tables as work_tables,
+)
 from ._textile import (
     DRAPE_BANDS as DRAPE_BANDS,
     cantilever_test as cantilever_test,

@@ -25,12 +25,12 @@ from ..dressing import (
     make_dresser,
 )
 from ..garment import TEMPLATES, Template
-from ..models import Predictor, load_predictor, read_card, weights_size
+from ..models import Predictor, load_predictor, weights_size
 from ..motion import BLOCK, Motion
-from ._evaluate import DIGITS
 from ._method_names import method_name
 from ._methods import Method, network, skinning
 from ._metrics import vertex_error
+from ._saved_rows import weights_digest
 
 # Calls are timed for at least this long [s], and at least this often.
 _SECONDS, _MIN_CALLS = 2.0, 10
@@ -140,7 +140,6 @@ def network_costs(
     size = pathlib.Path(method_name(bare)).name
     predictor = load_predictor(weights)
     params = sum(x.size for x in jax.tree.leaves(predictor.state))
-    digest = str(read_card(weights)["sha256"])[:DIGITS]
     for collisions in (False, True):
         method = "network+push" if collisions else "network"
         for number in garments:
@@ -165,7 +164,7 @@ def network_costs(
                     weights_mb=weights_size(weights) / 1e6,
                     precision=precision,
                     rmse_each=_garment_errors(known, TEMPLATES[:number]),
-                    weights=digest,
+                    weights=weights_digest(weights),
                 )
 
 
@@ -226,8 +225,6 @@ def mean_errors(
     method: Method,
     sequences: Items[Sequence],
     templates: Items[Template],
-    *,
-    report: Callable[[], None] | None = None,
 ) -> dict[Template, float]:
     """Root mean square error over vertices, averaged over actions [mm], by template."""
     out: dict[Template, float] = {}
@@ -238,8 +235,6 @@ def mean_errors(
                 continue
             reference = skinning()(s.motion, t).positions + s.offsets[t]
             found.append(vertex_error(method(s.motion, t).positions, reference).rmse_mm)
-            if report is not None:
-                report()
         if found:
             out[t] = statistics.fmean(found)
     return out
@@ -248,7 +243,7 @@ def mean_errors(
 def network_errors(
     inference: Inference,
     sequences: Items[Sequence],
-    report: Callable[[], None] | None = None,
+    *,
     precision: Precision = "float32",
 ) -> dict[str, dict[Template, float]]:
     """`mean_errors` of a network without and with collision resolution."""
@@ -257,7 +252,6 @@ def network_errors(
             network(dataclasses.replace(inference, collisions=collisions), precision),
             sequences,
             TEMPLATES,
-            report=report,
         )
         for name, collisions in (("network", False), ("network+push", True))
     }

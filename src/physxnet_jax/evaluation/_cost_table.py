@@ -3,14 +3,11 @@
 import dataclasses
 import importlib.resources
 import json
-import os
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import jax
-
-from .._environment import cache_folder, processor_name
+from .._environment import cache_folder
 from .._version import __version__
 from ..dressing import Inference, Simulation, make_dresser
 from ..errors import PhysXNetError
@@ -21,6 +18,7 @@ from ..motion import BLOCK, Motion, load_motion
 from ..simulation import PRESETS
 from ._cost import clothing_cost
 from ._method_names import PUSH, RELAX, method_by_name, parse_method
+from ._saved_rows import machine
 
 _FRAMES = 64
 # Calls of a network are timed for this long [s].
@@ -136,7 +134,8 @@ class _Clock:
 
     def __init__(self, path: pathlib.Path, frames: int) -> None:
         cached = _read(path)
-        self._path, self._machine = path, _machine()
+        self._path = path
+        self._machine = machine() | {"timed": _TIMING_VERSION, "version": __version__}
         same = cached.get("machine") == self._machine
         self.times: dict[str, dict[str, float]] = cached["times"] if same else {}
         walk = load_motion("walk", fps=30.0)
@@ -263,17 +262,6 @@ def select_method(
         finer = min(better, key=cost)
         summary += f"; {finer.name} would take {cost(finer):.2f} ms for {error(finer):.1f} mm"
     return Selection(best, cost(best), error(best), summary)
-
-
-def _machine() -> dict[str, Any]:
-    return {
-        "device": jax.devices()[0].device_kind,
-        "cores": os.cpu_count(),
-        "processor": processor_name(),
-        "jax": jax.__version__,
-        "timed": _TIMING_VERSION,
-        "version": __version__,
-    }
 
 
 def _read(path: pathlib.Path) -> dict[str, Any]:

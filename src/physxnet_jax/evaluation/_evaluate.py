@@ -25,14 +25,13 @@ from ._motion_metrics import (
     jitter,
 )
 from ._penetration import penetration
+from ._saved_rows import DIGITS
 from ._strain import edge_strain
 
 # Resolution of the maps for texel errors, whatever the network's resolution.
 _RESOLUTION = 128
 # Penetration is measured in every fifth frame: it takes longer than all other metrics.
 _PENETRATION_STRIDE = 5
-DIGITS = 16
-"""Number of digits of the checksums in rows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,6 +143,7 @@ def retime(
     sequences: Items[Sequence],
     rows: Items[ActionError],
     *,
+    templates: Items[str],
     report: Callable[[str, int, int], None] | None = None,
 ) -> Iterator[ActionError]:
     """Measures the times of rows again, one after another, so that their ratios are comparable.
@@ -152,6 +152,7 @@ def retime(
         methods: Methods by name; rows of other methods are yielded unchanged.
         sequences: The actions of the rows.
         rows: Rows measured before.
+        templates: Garments to time; rows of others are yielded unchanged.
         report: Called with a text, the rows done and the total.
 
     Yields:
@@ -161,7 +162,8 @@ def retime(
     for k, row in enumerate(rows):
         if report is not None:
             report(f"{row.method}, {row.action}, {row.template}", k, len(rows))
-        if row.method in methods and row.action in actions:
+        timed = row.method in methods and row.template in templates
+        if timed and row.action in actions:
             prediction = methods[row.method](actions[row.action].motion, row.template)  # pyright: ignore[reportArgumentType]
             row = dataclasses.replace(row, ms_per_frame=prediction.ms_per_frame)
         yield row

@@ -1,8 +1,12 @@
-"""Names of methods in rows of tables; no other module interprets their suffixes."""
+"""Names of methods in rows of tables, and what their suffixes stand for."""
 
+import dataclasses
 import pathlib
+from collections.abc import Sequence
 
 from ..dressing import EXTERNAL_ENGINES, Inference
+from ..errors import PhysXNetError
+from ..garment import Template
 from ..models import load_predictor
 from ..simulation import PRESETS
 from ._methods import PERTURBATION, Method, Simulator, external_engine, network, skinning
@@ -52,7 +56,7 @@ def method_name(inference: Inference) -> str:
     )
 
 
-def method_by_name(name: str) -> Method:
+def method_by_name(name: str, templates: Sequence[Template] = ()) -> Method:
     """A method by the name of its row.
 
     ``perturbed`` is the simulator with a root perturbed by `PERTURBATION`. Its distance to the
@@ -61,9 +65,11 @@ def method_by_name(name: str) -> Method:
     Args:
         name: ``lbs``, ``perturbed``, an accuracy of the simulator, an external engine, or a
             network as in `parse_method`.
+        templates: Templates that a network must have decoders for.
 
     Raises:
         WeightsError: There are no such weights.
+        PhysXNetError: The network lacks a decoder.
     """
     if name == "lbs":
         return skinning()
@@ -74,6 +80,11 @@ def method_by_name(name: str) -> Method:
     if name in EXTERNAL_ENGINES:
         return external_engine(name)
     inference = parse_method(name)
-    # Missing weights are reported before a long computation starts.
-    load_predictor(str(inference.weights))
-    return network(inference)
+    # Wrong weights are reported before a long computation starts.
+    predictor = load_predictor(str(inference.weights))
+    missing = set(templates) - set(predictor.config.templates)
+    if missing:
+        raise PhysXNetError(
+            f"{name} has no decoder for {', '.join(sorted(missing))}; leave them out."
+        )
+    return network(dataclasses.replace(inference, weights=predictor))

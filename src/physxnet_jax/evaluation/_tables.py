@@ -1,8 +1,10 @@
-"""Tables of errors as Markdown."""
+"""Tables of measurements as Markdown."""
 
 import math
 from collections.abc import Sequence as Items
 
+from ._bench import Work, time_to_error
+from ._cost import Cost
 from ._evaluate import ActionError, means
 
 
@@ -109,3 +111,102 @@ def _actions(rows: Items[ActionError], name: str) -> list[str]:
             cells.append(f"{found[0]:.1f}" if found else "")
         lines.append(f"| {action} | " + " | ".join(cells) + " |")
     return lines
+
+
+_COST_COLUMNS = (
+    "method",
+    "size",
+    "garments",
+    "batch",
+    "RMSE mm",
+    "of each",
+    "ms a frame",
+    "network ms",
+    "gradient ms",
+    "cold s",
+    "parameters",
+    "MFLOP a frame",
+    "weights MB",
+    "peak MB",
+    "gradient MB",
+)
+
+
+def cost_rows_table(rows: Items[Cost]) -> str:
+    """Rows of `bench_networks`; the devices are named if there are several."""
+    several = len({r.device for r in rows}) > 1
+    columns = (*_COST_COLUMNS[:2], *(["device"] if several else []), *_COST_COLUMNS[2:])
+    lines = [f"| {' | '.join(columns)} |", "|" + "---|" * len(columns)]
+    for r in rows:
+        cells = (
+            r.method,
+            r.size if r.precision == "float32" else f"{r.size} {r.precision}",
+            *([r.device] if several else []),
+            str(r.garments),
+            str(r.batch),
+            _number(r.rmse_mm, ".1f"),
+            " / ".join(f"{x:.1f}" for x in r.rmse_each.values()) if r.garments > 1 else "",
+            f"{r.ms_per_frame:.2f}",
+            f"{r.ms_network:.2f}" if r.ms_network else "",
+            _number(r.ms_backward, ".1f"),
+            _number(r.cold_s, ".1f"),
+            f"{r.params:,}" if r.params else "",
+            _number(r.flops / 1e6 / r.batch, ".0f"),
+            f"{r.weights_mb:.1f}" if r.weights_mb else "",
+            _number(r.peak_mb, ".0f"),
+            _number(r.backward_mb, ".0f"),
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _number(value: float, spec: str) -> str:
+    return "" if math.isnan(value) else format(value, spec)
+
+
+_WORK_COLUMNS = (
+    "solver",
+    "setting",
+    "rms mm",
+    "max mm",
+    "inside",
+    "pinched",
+    "bad frames",
+    "strain",
+    "ms/frame",
+    "against",
+)
+
+
+def work_tables(rows: Items[Work]) -> str:
+    """Rows of `bench_simulation`, a table for each scene, with the cheapest within 1 and 10 mm."""
+    out = []
+    for scene in dict.fromkeys(r.scene for r in rows):
+        mine = [r for r in rows if r.scene == scene]
+        columns = " | ".join(_WORK_COLUMNS)
+        out += [f"### {scene}", "", f"| {columns} |", "|" + "---|" * len(_WORK_COLUMNS)]
+        out += [f"| {' | '.join(_work_cells(r))} |" for r in mine]
+        out.append("")
+        for limit in (1.0, 10.0):
+            best = time_to_error(mine, limit)
+            said = "none" if best is None else f"{best.solver} with {best.setting} substeps"
+            cost = "" if best is None else f", {best.ms_per_frame:.1f} ms a frame"
+            out += [f"Cheapest within {limit:g} mm (rms): {said}{cost}.", ""]
+    return "\n".join(out)
+
+
+def _work_cells(r: Work) -> list[str]:
+    if r.failed:
+        return [r.solver, r.setting, "failed", r.failed, *[""] * 5, r.reference]
+    return [
+        r.solver,
+        r.setting,
+        f"{r.rms_mm:.3g}",
+        f"{r.max_mm:.3g}",
+        f"{100 * r.penetration_share:.2f} %",
+        f"{100 * r.pinched_share:.2f} %",
+        str(r.penetrating_frames),
+        f"{r.strain_p99:.3f}",
+        f"{r.ms_per_frame:.1f}",
+        r.reference,
+    ]

@@ -111,11 +111,13 @@ def load_garment(
     """
     body = load_body() if body is None else body
     item = parse_wear(path)
-    path, kind = item.name, item.template
-    if item.fabric is not None:
-        plain = f"{path}:as={kind}" if kind else path
-        garment, report = load_garment(plain, body=body)
-        return with_fabric(garment, item.fabric), report
+    garment, report = _load(item.name, item.template, body)
+    return garment if item.fabric is None else with_fabric(garment, item.fabric), report
+
+
+def _load(
+    path: str | pathlib.Path, kind: Template | None, body: Body
+) -> tuple[Garment, GarmentReport]:
     if str(path) in TEMPLATES:
         if kind is not None:
             raise PhysXNetError(f"{path} is a template: leave 'as' out.")

@@ -48,16 +48,7 @@ def average_networks(predictors: Sequence[Predictor]) -> Predictor:
     reference = first.normalisation
     networks = []
     for p in predictors:
-        scales = [(reference.velocity, p.normalisation.velocity)]
-        scales.append((reference.acceleration, p.normalisation.acceleration))
-        compatible = all(np.isclose(float(a), float(b), rtol=1e-4) for a, b in scales)
-        compatible &= all(
-            np.array_equal(p.texel_points.valid[t], first.texel_points.valid[t])
-            for t in first.config.templates
-            if p.config == first.config
-        )
-        compatible &= p.mirror_tta == first.mirror_tta
-        if p.config != first.config or not compatible:
+        if not _is_compatible(p, first):
             raise ValueError(
                 "networks of different configurations, input scales, texels or augmentation."
             )
@@ -79,3 +70,15 @@ def _scale_output(network: Generator, template: str, factor: Float[Array, ""]) -
         raise ValueError("average networks before their batch norm is folded.")
     last.kernel[...] = last.kernel[...] * factor
     last.bias[...] = last.bias[...] * jnp.broadcast_to(factor, last.bias[...].shape)
+
+
+def _is_compatible(p: Predictor, first: Predictor) -> bool:
+    """Whether two predictors have the same inputs and outputs."""
+    if p.config != first.config or p.mirror_tta != first.mirror_tta:
+        return False
+    a, b = p.normalisation, first.normalisation
+    scales = ((a.velocity, b.velocity), (a.acceleration, b.acceleration))
+    return all(np.isclose(float(x), float(y), rtol=1e-4) for x, y in scales) and all(
+        np.array_equal(p.texel_points.valid[t], first.texel_points.valid[t])
+        for t in first.config.templates
+    )

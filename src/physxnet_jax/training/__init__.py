@@ -1,7 +1,7 @@
 """Training: losses, step, loop, checkpoints."""
 
 from ._config import TrainConfig as TrainConfig
-from ._loop import prepare_targets as prepare_targets, train as train
+from ._loop import train as train
 from ._losses import (
     adversarial_loss as adversarial_loss,
     discriminator_loss as discriminator_loss,
@@ -24,3 +24,4 @@ from ._problem import (
     make_problem as make_problem,
 )
 from ._step import eval_step as eval_step, train_step as train_step
+from ._targets import prepare_targets as prepare_targets

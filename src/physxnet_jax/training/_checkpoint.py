@@ -28,7 +28,7 @@ class Checkpoints:
             ),
         )
 
-    def save(self, state: TrainState, info: dict[str, Any]) -> None:
+    def save(self, state: TrainState) -> None:
         """Saves a state under its step number, atomically.
 
         Raises:
@@ -38,9 +38,7 @@ class Checkpoints:
             return
         saved = self._manager.save(
             int(state.step),
-            args=ocp.args.Composite(
-                state=ocp.args.StandardSave(_plain(state)), info=ocp.args.JsonSave(info)
-            ),
+            args=ocp.args.Composite(state=ocp.args.StandardSave(_plain(state))),
         )
         self._manager.wait_until_finished()
         if not saved:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Sequence as Items
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
@@ -20,49 +19,20 @@ from ..data import Frames, Sequence, batch_indices, load_frames, mirrored_sequen
 from ..errors import FormatError, PhysXNetError
 from ..files import append_line, atomic_write
 from ..garment import template
-from ..geometry import mesh_edges
 from ..models import (
-    ModelConfig,
     Normalisation,
     Predictor,
     TexelPoints,
-    bind_garment,
-    make_texel_points,
 )
-from ..uv import Atlas, bind, garment_map_rows, make_atlas
+from ..uv import Atlas
 from ._checkpoint import Checkpoints, config_json
 from ._config import TrainConfig
 from ._monitor import METRICS, EarlyStopping, GanMonitor, TensorBoardLogger, read_metrics
-from ._problem import ClothTables, Loss, Problem, TrainState, make_problem
+from ._problem import Loss, Problem, TrainState, make_problem
 from ._step import eval_step, train_step
-from ._targets import measure_normalisation, target_offsets
+from ._targets import ClothTables, measure_normalisation, prepare_targets
 
 _Report = Callable[[int, int, dict[str, float]], None]
-
-
-def prepare_targets(model: ModelConfig) -> tuple[Atlas, TexelPoints, dict[str, ClothTables]]:
-    """Atlas, texel points and target tables of a model's templates on the default body."""
-    body = load_body()
-    rest = body.rest_vertices(body.default_shape())
-    atlas = make_atlas(model.resolution)
-    garments = {t: template(t) for t in model.templates}  # pyright: ignore[reportArgumentType]
-    rows = {t: garment_map_rows(atlas, body, rest, g) for t, g in garments.items()}
-    texel_points = make_texel_points(atlas, body, rest, {t: r.valid for t, r in rows.items()})
-    tables = {
-        t: ClothTables(
-            to_cloth=rows[t],
-            rest=g.rest_vertices(rest),
-            skin=g.skin,
-            anchor=texel_points.rest_dress if t == "dress" else texel_points.rest,
-            anchor_weights=texel_points.weights,
-            bound=bind_garment(
-                body, rest, g, bind(g, atlas=atlas, body=body, rest=rest, valid=rows[t].valid)
-            ),
-            edges=jnp.asarray(mesh_edges(np.asarray(g.mesh.faces)).vertices),
-        )
-        for t, g in garments.items()
-    }
-    return atlas, texel_points, tables
 
 
 def train(
@@ -117,9 +87,9 @@ def train(
     run = _Run(folder, problem, first, data, total)
     try:
         run.train(total if steps is None else min(steps, total), report)
+        return make_predictor(problem, run.best())
     finally:
         run.close()
-    return make_predictor(problem, run.best())
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -137,8 +107,8 @@ class _Data:
 def _load_data(config: TrainConfig, sequences: Items[Sequence]) -> _Data:
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
-    atlas, texel_points, tables = prepare_targets(config.model)
     garments = {t: template(t) for t in config.model.templates}  # pyright: ignore[reportArgumentType]
+    atlas, texel_points, tables = prepare_targets(config.model)
     held = _held_out(config, sequences)
     used = [s for s in sequences if s.name not in config.validation]
     # One at a time: each is as large as its original.
@@ -163,7 +133,9 @@ def _load_data(config: TrainConfig, sequences: Items[Sequence]) -> _Data:
         atlas=atlas,
         texel_points=texel_points,
         tables=tables,
-        normalisation=_normalisation(config, frames, texel_points, tables),
+        normalisation=measure_normalisation(
+            frames, texel_points, tables, config.model.family, seed=config.seed
+        ),
     )
 
 
@@ -192,7 +164,6 @@ class _Run:
         self._best = Checkpoints(folder / "best", keep=1)
         restored = self._checkpoints.latest(first)
         self._state = first if restored is None else restored
-        self._saved = -1 if restored is None else int(restored.step)
         self._done = int(self._state.step)
         self._best.forget_after(self._done)
         logged = read_metrics(folder)
@@ -228,7 +199,7 @@ class _Run:
             if self._done % config.validate_every == 0 or self._done == self._total:
                 self._validate(log)
             if self._done % config.checkpoint_every == 0:
-                self._checkpoints.save(self._state, {"step": self._done})
+                self._checkpoints.save(self._state)
 
     def _check_finite(self) -> None:
         states = (self._state.generator_opt, self._state.discriminator_opt)
@@ -244,22 +215,21 @@ class _Run:
             return
         losses, shown = _validate(self._problem, self._state, self._data.unseen)
         if self._stopping.update(losses["validation_mm"]):
-            self._best.save(self._state, {"step": self._done, **losses})
+            self._best.save(self._state)
         log(losses)
         self._board.show(shown, self._done)
 
     def best(self) -> TrainState:
         """The state that did best in validation; the last one without validation."""
         best = self._best.latest(self._first) if self._data.unseen is not None else None
-        self._best.close()
         return self._state if best is None else best
 
     def close(self) -> None:
         """Saves what isn't saved yet."""
         self._board.close()
-        if self._saved != int(self._state.step):
-            self._checkpoints.save(self._state, {"step": int(self._state.step)})
+        self._checkpoints.save(self._state)
         self._checkpoints.close()
+        self._best.close()
 
 
 def _held_out(config: TrainConfig, sequences: Items[Sequence]) -> list[Sequence]:
@@ -342,30 +312,3 @@ def make_predictor(problem: Problem, state: TrainState) -> Predictor:
         graph,
         problem.config.model,
     )
-
-
-def _normalisation(
-    config: TrainConfig, frames: Frames, texel_points: TexelPoints, tables: dict[str, ClothTables]
-) -> Normalisation:
-    rng = np.random.default_rng(config.seed)
-    offsets = {}
-    for t, c in tables.items():
-        good = np.flatnonzero(frames.usable[t])
-        if len(good) == 0:
-            raise FormatError(
-                f"no usable sequence for '{t}': simulate it, or drop it from the templates."
-            )
-        pick = rng.choice(good, min(32, len(good)), replace=False)
-        meters = target_offsets(
-            jnp.asarray(frames.targets[t][pick]),
-            c.to_cloth,
-            c.rest,
-            c.skin,
-            c.anchor,
-            c.anchor_weights,
-            jnp.asarray(frames.rotations[pick, -1]),
-            jnp.asarray(frames.translations[pick, -1]),
-            config.model.family,
-        )
-        offsets[t] = meters[:, np.asarray(texel_points.valid[t])]
-    return measure_normalisation(frames, texel_points, offsets, seed=config.seed)

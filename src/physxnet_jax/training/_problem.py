@@ -10,14 +10,13 @@ from flax import nnx
 from jaxtyping import Array, Bool, Float
 
 from ..models import (
-    BoundGarment,
     Discriminator,
     Normalisation,
     TexelPoints,
     make_generator,
 )
 from ..typing import pytree
-from ..uv import Atlas, Transference
+from ..uv import Atlas
 from ._config import TrainConfig
 from ._losses import (
     masked_l1,
@@ -26,6 +25,7 @@ from ._losses import (
     vertex_loss,
 )
 from ._optimizer import make_optimizer
+from ._targets import ClothTables
 
 
 @pytree
@@ -50,30 +50,6 @@ class TrainState:
     generator_opt: Any
     discriminator_opt: Any
     step: Array
-
-
-@pytree
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ClothTables:
-    """Data that converts a template's stored offsets to texel targets.
-
-    Attributes:
-        to_cloth: The transference matrix T_BC.
-        rest: Garment vertices at rest [m].
-        skin: Their skinning weights.
-        anchor: Texel points at rest that the offsets start from [m].
-        anchor_weights: Their skinning weights.
-        bound: The template bound to the atlas.
-        edges: Vertex indices of its edges, shape [edges, 2].
-    """
-
-    to_cloth: Transference
-    rest: Array
-    skin: Array
-    anchor: Array
-    anchor_weights: Array
-    bound: BoundGarment
-    edges: Array
 
 
 @pytree

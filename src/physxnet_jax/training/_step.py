@@ -10,10 +10,7 @@ from flax import nnx
 from jaxtyping import Array, Float, Key
 
 from ..data import QUANTIZATION_STEP
-from ..models import (
-    clip_features,
-    normalise,
-)
+from ..models import clip_features, normalise
 from ._losses import (
     adversarial_loss,
     discriminator_loss,
@@ -41,14 +38,10 @@ def _prepare(problem: Problem, batch: Batch) -> tuple[Array, dict[str, Array], d
     x = problem.atlas.to_map(normalise(features[:, 0], problem.normalisation, inputs))
     targets, masks = {}, {}
     for t in config.model.templates:
-        c = problem.tables[t]
         meters = target_offsets(
             batch[f"target_{t}"],
-            c.to_cloth,
-            c.rest,
-            c.skin,
-            c.anchor,
-            c.anchor_weights,
+            problem.tables[t],
+            points,
             batch["rotations"][:, -1],
             batch["translations"][:, -1],
             inputs.family,
@@ -78,7 +71,7 @@ def _loss_inputs(
     )
 
 
-def _mean_error(problem: Problem, x: LossInputs) -> Float[Array, ""]:
+def _mean_error(x: LossInputs) -> Float[Array, ""]:
     """L1 at texels relative to their scale: reported whatever is minimised."""
     return masked_l1(x.texels, x.target, x.valid, x.weight)
 
@@ -117,7 +110,7 @@ def eval_step(
     for t in config.model.templates:
         scale = problem.normalisation.offset[t]
         found = _loss_inputs(problem, t, maps[t], targets, batch)
-        losses[t] = 1e3 * scale * _mean_error(problem, found)
+        losses[t] = 1e3 * scale * _mean_error(found)
         wanted = problem.atlas.to_map(targets[t])
         shown[t] = (maps[t] * masks[t] * scale, wanted * masks[t] * scale)
     return losses, shown
@@ -152,7 +145,7 @@ def train_step(
         total, parts = jnp.zeros(()), {}
         for t in templates:
             found = _loss_inputs(problem, t, maps[t], targets, batch)
-            parts[t] = _mean_error(problem, found)
+            parts[t] = _mean_error(found)
             total = total + problem.loss(found) / len(templates)
         fake = _stack(problem, maps, masks)
         adv = jnp.zeros(())

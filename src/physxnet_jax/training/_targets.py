@@ -5,23 +5,71 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from ..body import skin_points
+from ..body import load_body, skin_points
 from ..data import QUANTIZATION_STEP, Frames
-from ..models import PAPER, Family, Normalisation, TexelPoints, clip_features
-from ..uv import Transference
+from ..errors import FormatError
+from ..garment import template
+from ..geometry import mesh_edges
+from ..models import (
+    PAPER,
+    BoundGarment,
+    Family,
+    ModelConfig,
+    Normalisation,
+    TexelPoints,
+    bind_garment,
+    clip_features,
+    make_texel_points,
+)
+from ..typing import pytree
+from ..uv import Atlas, Transference, bind, garment_map_rows, make_atlas
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ClothTables:
+    """Data that converts a template's stored offsets to texel targets.
+
+    Attributes:
+        to_cloth: The transference matrix T_BC.
+        bound: The template bound to the atlas.
+        edges: Vertex indices of its edges, shape [edges, 2].
+    """
+
+    to_cloth: Transference
+    bound: BoundGarment
+    edges: Array
+
+
+def prepare_targets(model: ModelConfig) -> tuple[Atlas, TexelPoints, dict[str, ClothTables]]:
+    """Atlas, texel points and target tables of a model's templates on the default body."""
+    body = load_body()
+    rest = body.rest_vertices(body.default_shape())
+    atlas = make_atlas(model.resolution)
+    garments = {t: template(t) for t in model.templates}  # pyright: ignore[reportArgumentType]
+    rows = {t: garment_map_rows(atlas, body, rest, g) for t, g in garments.items()}
+    texel_points = make_texel_points(atlas, body, rest, {t: r.valid for t, r in rows.items()})
+    tables = {
+        t: ClothTables(
+            to_cloth=rows[t],
+            bound=bind_garment(
+                body, rest, g, bind(g, atlas=atlas, body=body, rest=rest, valid=rows[t].valid)
+            ),
+            edges=jnp.asarray(mesh_edges(np.asarray(g.mesh.faces)).vertices),
+        )
+        for t, g in garments.items()
+    }
+    return atlas, texel_points, tables
 
 
 def target_offsets(
-    target: Array,
-    to_cloth: Transference,
-    garment_rest: Array,
-    skin: Array,
-    anchor: Array,
-    anchor_weights: Array,
-    rotations: Array,
-    translations: Array,
+    stored: Int[Array, "batch vertices 3"],
+    table: ClothTables,
+    texel_points: TexelPoints,
+    rotations: Float[Array, "batch joints 3 3"],
+    translations: Float[Array, "batch joints 3"],
     family: Family,
 ) -> Float[Array, "batch texels 3"]:
     """Targets at texels [m] from stored vertex offsets.
@@ -29,13 +77,15 @@ def target_offsets(
     ``paper`` adds the skinning back and subtracts the skin at the texel (I_C of equation 9);
     ``local`` needs neither.
     """
-    offset = target.astype(jnp.float32) * QUANTIZATION_STEP
+    offset = stored.astype(jnp.float32) * QUANTIZATION_STEP
     if family == "local":
-        return to_cloth @ offset
+        return table.to_cloth @ offset
+    garment, points = table.bound, texel_points
+    anchor = points.rest_dress if garment.template == "dress" else points.rest
 
     def one(o: Array, r: Array, t: Array) -> Array:
-        cloth = skin_points(garment_rest, skin, r, t)[0] + o
-        return to_cloth @ cloth - skin_points(anchor, anchor_weights, r, t)[0]
+        cloth = skin_points(garment.rest, garment.skin, r, t)[0] + o
+        return table.to_cloth @ cloth - skin_points(anchor, points.weights, r, t)[0]
 
     return jax.vmap(one)(offset, rotations, translations)
 
@@ -43,7 +93,8 @@ def target_offsets(
 def measure_normalisation(
     frames: Frames,
     texel_points: TexelPoints,
-    offsets_of: dict[str, Array],
+    tables: dict[str, ClothTables],
+    family: Family,
     *,
     samples: int = 128,
     seed: int = 0,
@@ -53,9 +104,13 @@ def measure_normalisation(
     Args:
         frames: Training frames.
         texel_points: Texels.
-        offsets_of: Target offsets of sampled frames for each template [m].
+        tables: From `prepare_targets`.
+        family: Kind of the targets, see `target_offsets`.
         samples: Number of sampled frames.
         seed: Seed of the sample.
+
+    Raises:
+        FormatError: A template has no usable frame.
 
     Note (differs from the paper):
         A percentile instead of the largest value: one fast hand in one frame would
@@ -79,6 +134,8 @@ def measure_normalisation(
         for i in pick
     ]
     features = np.stack(rows)
+    # Its own generator: the samples of maps and of targets are independent.
+    rng = np.random.default_rng(seed)
 
     def scale(x: np.ndarray) -> Array:
         return jnp.asarray(max(float(np.quantile(x, 0.999)), 1e-6), jnp.float32)
@@ -86,5 +143,34 @@ def measure_normalisation(
     return Normalisation(
         scale(features[..., :3]),
         scale(features[..., 3:6]),
-        {t: scale(np.abs(np.asarray(o))) for t, o in offsets_of.items()},
+        {
+            t: scale(np.abs(_sample_targets(frames, texel_points, t, table, family, rng)))
+            for t, table in tables.items()
+        },
     )
+
+
+def _sample_targets(
+    frames: Frames,
+    texel_points: TexelPoints,
+    name: str,
+    table: ClothTables,
+    family: Family,
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "samples texels 3"]:
+    """Targets of a template in some of its usable frames, at the texels that it covers [m]."""
+    good = np.flatnonzero(frames.usable[name])
+    if len(good) == 0:
+        raise FormatError(
+            f"no usable sequence for '{name}': simulate it, or drop it from the templates."
+        )
+    pick = rng.choice(good, min(32, len(good)), replace=False)
+    meters = target_offsets(
+        jnp.asarray(frames.targets[name][pick]),
+        table,
+        texel_points,
+        jnp.asarray(frames.rotations[pick, -1]),
+        jnp.asarray(frames.translations[pick, -1]),
+        family,
+    )
+    return np.asarray(meters)[:, np.asarray(texel_points.valid[name])]

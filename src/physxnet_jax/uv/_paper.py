@@ -20,20 +20,26 @@ class Transferences:
 
     Attributes:
         atlas: The atlas of all maps.
-        T_UB: From body vertices to texels (equation 5).
         T_BC: From garment vertices to texels, by rays from the skin (equation 8); ``valid``
             where the ray hit cloth.
-        T_XB: From body vertices to garment vertices, by rays from the garment (equation 9).
         binding: Texels that garment vertices sample, with counts of fallbacks.
         garment: The garment.
     """
 
     atlas: Atlas
-    T_UB: Transference
     T_BC: Transference
-    T_XB: Transference
     binding: Binding
     garment: Garment
+
+    @property
+    def T_UB(self) -> Transference:
+        """From body vertices to texels (equation 5)."""
+        return self.atlas.to_body
+
+    @property
+    def T_XB(self) -> Transference:
+        """From body vertices to garment vertices, by rays from the garment (equation 9)."""
+        return self.binding.to_body
 
 
 @pytree
@@ -84,9 +90,7 @@ def transference(
     binding = bind(garment, atlas=atlas, body=body, rest=rest)
     return Transferences(
         atlas=atlas,
-        T_UB=atlas.to_body,
         T_BC=to_cloth,
-        T_XB=binding.to_body,
         binding=binding,
         garment=garment,
     )

@@ -23,7 +23,7 @@ from ..dressing import (
     with_body,
 )
 from ..errors import PhysXNetError
-from ..evaluation import load_cost_table, method_name
+from ..evaluation import load_cost_table, method_name, parse_method
 from ..garment import FABRICS, with_default_fabric
 from ..io import AnimatedMesh
 from ..models import Predictor, load_predictor, read_card
@@ -176,9 +176,9 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     lines = [f"{clip.num_frames} frames at {clip.fps:g} fps"]
     if choice.wear and choice.method == "simulate":
         garments, ms = _simulated(choice, clip, progress)
-        lines.append(
-            f"simulated ({choice.simulation.accuracy}): {ms:.0f} ms a frame, compilation included"
-        )
+        engine = choice.simulation.engine
+        how = choice.simulation.accuracy if engine == "xpbd" else engine
+        lines.append(f"simulated ({how}): {ms:.0f} ms a frame, compilation included")
     elif choice.wear:
         garments, found = _dressed(choice, clip, shape, progress)
         lines += found
@@ -241,8 +241,7 @@ def _compared(
     progress: Progress | None,
 ) -> tuple[tuple[AnimatedMesh, ...], dict[str, np.ndarray]]:
     """The simulation beside the garments, and the distances to it [m]."""
-    standard = dataclasses.replace(choice.simulation, accuracy="standard")
-    reference, _ = _simulated(dataclasses.replace(choice, simulation=standard), clip, progress)
+    reference, _ = _simulated(choice, clip, progress)
     by_name = {m.name: m.positions for m in reference}
     return reference, {
         m.name: np.linalg.norm(m.positions - by_name[m.name], axis=2) for m in garments
@@ -268,6 +267,9 @@ def _simulated(
 def _known_error(choice: Choice) -> str:
     """The tabulated error of this method, which doesn't depend on the clip."""
     name = "lbs" if choice.method == "lbs" else method_name(choice.inference)
+    iterations = choice.inference.strain_iterations
+    if choice.method == "network" and iterations != parse_method(name).strain_iterations:
+        return ""
     for profile in load_cost_table():
         if profile.name == name:
             errors = ", ".join(f"{t} {e:.1f}" for t, e in profile.rmse_mm.items())

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..body import load_body
-from ..dressing import METHODS, Inference, Simulation
+from ..dressing import METHODS, Inference
 from ..errors import FormatError, PhysXNetError
 from ..files import atomic_write
 from ..garment import FABRICS, TEMPLATES
@@ -115,9 +115,9 @@ class Viewer:
             live=w["live"].value,
             shape=shape,
             fabric=None if w["fabric"].value == "as cut" else w["fabric"].value,
-            simulation=Simulation(
+            simulation=dataclasses.replace(
+                first.simulation,
                 accuracy=w["accuracy"].value,
-                engine=first.simulation.engine,
                 wind=wind if any(wind) else None,
                 self_contact=w["self_contact"].value,
             ),
@@ -134,6 +134,10 @@ class Viewer:
         with self._lock:
             self._requested = self.chosen()
             self._wake.set()
+
+    def _ask_or_report(self) -> None:
+        with self._reporting_errors():
+            self.ask()
 
     def wait(self, seconds: float = 600.0) -> Shown:
         """Waits until the current settings are shown.
@@ -293,7 +297,7 @@ class Viewer:
             export_button = gui.add_button("export")
         self._widgets = w
         for handle in (*w.values(), *self._shapes.values()):
-            handle.on_update(lambda _: self.ask())
+            handle.on_update(lambda _: self._ask_or_report())
         self._frame.on_update(lambda _: self._show_frame())
         self._show_maps.on_update(lambda _: self._show_frame())
 
@@ -316,7 +320,7 @@ class Viewer:
             self._worn[name].value = worn
             return
         box = self.server.gui.add_checkbox(name, worn)
-        box.on_update(lambda _: self.ask())
+        box.on_update(lambda _: self._ask_or_report())
         self._worn[name] = box
 
     @contextlib.contextmanager

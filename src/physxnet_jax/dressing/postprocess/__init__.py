@@ -9,6 +9,7 @@ from ._collisions import (
     BodyCollider as BodyCollider,
     apply_collisions as apply_collisions,
     faces_at_rest as faces_at_rest,
+    make_colliders as make_colliders,
     prepare_collisions as prepare_collisions,
     reshape_colliders as reshape_colliders,
     resolve_collisions_with_skin as resolve_collisions_with_skin,

@@ -92,8 +92,11 @@ def prepare_collisions(outfit: Outfit, inference: Inference) -> tuple[BodyCollid
         outfit: The garments.
         inference: Its ``collisions`` enable the step.
     """
-    if not inference.collisions:
-        return None
+    return make_colliders(outfit) if inference.collisions else None
+
+
+def make_colliders(outfit: Outfit) -> tuple[BodyCollider, ...]:
+    """`prepare_collisions` whatever was requested: for measurements of penetration."""
     pairs = zip(outfit.worn, outfit.garments, strict=True)
     colliders = [make_collider(outfit.body, outfit.rest, w, g.mesh) for w, g in pairs]
     return set_layer_clearance(colliders, outfit.worn)
