@@ -57,7 +57,7 @@ def reference():
 @pytest.mark.parametrize(
     ("make", "order", "within", "substeps"),
     [
-        (lambda n: XPBD(n, 8), 1.0, 0.15, (32, 64, 128)),
+        (lambda n: XPBD(n, 8, order=1), 1.0, 0.15, (32, 64, 128)),
         (lambda n: Implicit(n, 1, newton=3, order=1), 1.0, 0.15, (16, 32, 64)),
         (
             lambda n: Implicit(n, 1, "float64", order=2, newton=3, tolerance=1e-8),
@@ -73,6 +73,14 @@ def test_solvers_reach_their_order_of_convergence(reference, make, order, within
     error = [rms(last(scene, make(n)), truth) for n in substeps]
     fitted = -np.polyfit(np.log2(substeps), np.log2(error), 1)[0]
     assert fitted == pytest.approx(order, abs=within), error
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("substeps", [32, 64, 128])
+def test_xpbd_of_order_2_has_a_fraction_of_the_error_of_order_1(reference, substeps):
+    scene, truth = reference
+    first, second = (rms(last(scene, XPBD(substeps, 8, order=o)), truth) for o in (1, 2))
+    assert second < 0.35 * first
 
 
 def test_free_fall_baseline_has_the_largest_error(reference):

@@ -50,7 +50,7 @@ class Bench:
     """net: rows of `physxnet evaluate` against that dataset; their errors aren't measured again,
     and replace those of rows in --out."""
     simulator: tuple[
-        Literal["draft", "standard", "fine", "perturbed", "blender", "newton"], ...
+        Literal["draft", "standard", "fine", "reference", "perturbed", "blender", "newton"], ...
     ] = ()
     """net: accuracies of the simulator to run as well; perturbed is standard with a perturbed
     root. blender, newton: times only, because they model another cloth."""

@@ -11,6 +11,7 @@ from ..errors import PhysXNetError
 if TYPE_CHECKING:
     from ..dressing import Inference, Simulation
 
+Accuracy = Literal["draft", "standard", "fine", "reference"]
 Fabric = Literal["cotton", "denim", "silk", "wool", "jersey", "leather"]
 
 
@@ -38,7 +39,7 @@ class InferenceOptions:
 class EffectOptions:
     """Simulation."""
 
-    accuracy: Literal["draft", "standard", "fine"] | None = None
+    accuracy: Accuracy | None = None
     """Accuracy of the simulation; higher accuracy takes more time. By default that of the scene
     file, else standard."""
     wind: tuple[float, float, float] | None = None

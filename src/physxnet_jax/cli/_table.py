@@ -126,5 +126,5 @@ def rollout_table(clip: DressedClip, simulation: Simulation, seconds: float) -> 
     for flag in Status:
         count = int(np.count_nonzero(rollout.status & int(flag)))
         if count:
-            table.add_row(f"frames marked {flag.name}", str(count))
+            table.add_row(f"frames marked {flag.name}: {flag.advice}", str(count))
     return table

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import tomllib
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 from jaxtyping import Array, Float
 
@@ -14,7 +14,7 @@ from ..files import is_file
 from ..garment import FABRICS, parse_wear, with_fabric
 from ..io import split_part
 from ..motion import Motion, prepare_motion, sudden_turns
-from ..simulation import EFFECTS, PRESETS, Effect, Scene
+from ..simulation import EFFECTS, PRESETS, Accuracy, Effect, Scene
 from ._meshes import Wear, resolve_garments
 from ._simulate import Simulation, build_scene
 
@@ -43,14 +43,14 @@ class SceneFile:
     Attributes:
         scene: Garments, effects and shape.
         motion: The body's motion.
-        accuracy: ``draft``, ``standard`` or ``fine``.
+        accuracy: ``draft``, ``standard``, ``fine`` or ``reference``.
         lists_effects: Whether a file lists effects.
         notes: Remarks on the motion and on garments read from files.
     """
 
     scene: Scene
     motion: Motion
-    accuracy: Literal["draft", "standard", "fine"] = "standard"
+    accuracy: Accuracy = "standard"
     notes: tuple[str, ...] = ()
     lists_effects: bool = False
 

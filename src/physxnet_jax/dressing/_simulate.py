@@ -16,6 +16,7 @@ from ..motion import Motion
 from ..simulation import (
     EFFECTS,
     PRESETS,
+    Accuracy,
     Effect,
     Implicit,
     Rollout,
@@ -43,7 +44,7 @@ class Simulation:
     """Options of the cloth simulator.
 
     Attributes:
-        accuracy: ``draft``, ``standard`` or ``fine``.
+        accuracy: ``draft``, ``standard``, ``fine`` or ``reference``.
         engine: ``xpbd``; ``bdf2`` (implicit, second order); ``blender`` or ``newton``, which
             run out of process (PHYSXNET_BLENDER, PHYSXNET_NEWTON).
         wind: Steady wind [m/s].
@@ -52,7 +53,7 @@ class Simulation:
         resume: Folder that keeps finished blocks until the simulation completes.
     """
 
-    accuracy: Literal["draft", "standard", "fine"] = "standard"
+    accuracy: Accuracy = "standard"
     engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
     wind: tuple[float, float, float] | None = None
     self_contact: bool = False

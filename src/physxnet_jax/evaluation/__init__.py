@@ -83,6 +83,7 @@ from ._saved_rows import (
 from ._strain import edge_strain as edge_strain
 from ._stress import CASES as CASES, Finding as Finding, run_case as run_case
 from ._stress_worn import PEER_CASES as PEER_CASES, run_peer as run_peer
+from ._surface_faults import SurfaceFaults as SurfaceFaults, surface_faults as surface_faults
 from ._tables import (
     cost_rows_table as cost_rows_table,
     error_tables as error_tables,

@@ -151,7 +151,7 @@ class Simulator:
     """The package's simulator at a preset accuracy, optionally with a perturbed root.
 
     Args:
-        accuracy: ``draft``, ``standard`` or ``fine``.
+        accuracy: ``draft``, ``standard``, ``fine`` or ``reference``.
         moved: Standard deviation of normal noise added to the root [m]. The divergence
             from the unperturbed run is the smallest meaningful error.
     """

@@ -53,3 +53,4 @@ from ._topology import (
     mesh_edges as mesh_edges,
     vertex_faces as vertex_faces,
 )
+from ._visible_skin import VisibleSkin as VisibleSkin, visible_skin as visible_skin

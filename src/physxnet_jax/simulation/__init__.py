@@ -14,6 +14,7 @@ from ._prepared_scene import PreparedScene as PreparedScene
 from ._rollout import (
     PRESETS as PRESETS,
     ROLLOUT_BLOCK as ROLLOUT_BLOCK,
+    Accuracy as Accuracy,
     simulate as simulate,
     simulate_batch as simulate_batch,
     warmup as warmup,

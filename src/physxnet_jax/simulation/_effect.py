@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -55,6 +55,18 @@ class Clock:
     length: float = dataclasses.field(metadata={"static": True})
 
 
+class Step(NamedTuple):
+    """A substep.
+
+    Attributes:
+        length: Length for implicit formulas [s]; for BDF2 two thirds of the substep.
+        share: The substep's fraction of the contact interval.
+    """
+
+    length: float
+    share: float
+
+
 class Prepared:
     """An effect prepared for a scene: a pytree whose hooks do nothing by default.
 
@@ -68,6 +80,8 @@ class Prepared:
     elastic: ClassVar[bool] = False
     # Whether the effect prescribes vertex positions.
     kinematic: ClassVar[bool] = False
+    # Whether the effect only pushes, as contact does; XPBD starts anew where it begins to.
+    unilateral: ClassVar[bool] = False
     # Factors of `System.rescaled` that apply to the effect.
     materials: ClassVar[tuple[str, ...]] = ()
 
@@ -78,6 +92,10 @@ class Prepared:
 
     def rescaled(self, factors: Mapping[str, Any]) -> "Prepared":
         """The effect with scaled material parameters, see `System.rescaled`."""
+        return self
+
+    def at_step(self, h: float) -> "Prepared":
+        """The effect with tables for implicit substeps of ``h`` [s], for `project`."""
         return self
 
     def init_state(self, batch: int) -> Any:
@@ -139,7 +157,7 @@ class Prepared:
         start: Float[Array, "vertices 3 batch"],
         context: Any,
         progress: Float[Array, ""],
-        step: tuple[float, float],
+        step: Step,
     ) -> Float[Array, "vertices 3 batch"]:
         """Displacements [m] after projection onto the effect's constraints.
 
@@ -148,7 +166,7 @@ class Prepared:
             start: Displacement at the start of this substep [m].
             context: Result of `begin`.
             progress: Fraction of the interval done at the end of this substep, 0 to 1.
-            step: The substep [s] and its fraction of the interval.
+            step: The substep.
         """
         return displacement
 

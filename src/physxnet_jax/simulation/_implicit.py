@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 
 from ..errors import check_counts, check_numbers
 from ..typing import pytree
-from ._effect import Prepared
+from ._effect import Prepared, Step
 from ._solver import TOLERANCE, Solver, accelerate_all, split, stored_energy
 from ._state import System
 
@@ -92,7 +92,7 @@ class Implicit(Solver):
             x = d
             for e, c in rigid:
                 if e.kinematic:
-                    x = e.project(x, d, c, progress, (h, share))
+                    x = e.project(x, d, c, progress, Step(h, share))
             held = x
             worst = jnp.zeros((d.shape[0], d.shape[2]), d.dtype)
             if elastic:
@@ -112,7 +112,7 @@ class Implicit(Solver):
                 x = jnp.where(free > 0, target, held)
             predicted = x
             for e, c in rigid:
-                x = e.project(x, d, c, progress, (h, share))
+                x = e.project(x, d, c, progress, Step(h, share))
             after = (predicted - d) / h + bdf2 * ((predicted - d) - step) / (2 * h)
             new = (x, after + (x - predicted) / h, x - d, v, worst)
             return *new, jnp.zeros_like(first_step)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from ..errors import check_counts
-from ._effect import Prepared
+from ._effect import Prepared, Step
 from ._prepared_scene import PreparedScene
 from ._state import System
 
@@ -69,6 +69,10 @@ class Solver(abc.ABC):
         """Initial value of `State.solver_state`."""
         return ()
 
+    def at_step(self, system: System, h: float) -> System:
+        """The scene with tables that depend on the length of a substep [s]."""
+        return system
+
     @abc.abstractmethod
     def advance_interval(
         self,
@@ -103,7 +107,7 @@ class Solver(abc.ABC):
     ) -> Float[Array, "vertices batch"]:
         """Distance that another sweep would move each vertex, over the tolerance."""
         moved = project_all(
-            system.effects, contexts, displacement, displacement, jnp.ones(()), (h, 0.0)
+            system.effects, contexts, displacement, displacement, jnp.ones(()), Step(h, 0.0)
         )
         correction = moved - displacement
         return jnp.sqrt(jnp.sum(correction * correction, axis=1)) / TOLERANCE
@@ -115,7 +119,7 @@ def project_all(
     displacement: Array,
     start: Array,
     progress: Array,
-    step: tuple[float, float],
+    step: Step,
 ) -> Array:
     """One sweep over the constraints of all effects."""
     progress = progress.astype(displacement.dtype)

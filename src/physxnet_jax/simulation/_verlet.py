@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from ._effect import Step
 from ._solver import Solver, accelerate_all, project_all, split, stored_energy
 from ._state import System
 
@@ -50,7 +51,7 @@ class Verlet(Solver):
             v = v + 0.5 * h * system.inverse_mass * f
             predicted = d + h * v
             progress = (i + 1).astype(d.dtype) * share
-            x = project_all(effects, rigid_contexts, predicted, d, progress, (h, share))
+            x = project_all(effects, rigid_contexts, predicted, d, progress, Step(h, share))
             v = v + (x - predicted) / h
             f = force(x)
             v = v + 0.5 * h * system.inverse_mass * f

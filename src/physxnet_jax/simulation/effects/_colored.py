@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from ...geometry import greedy_coloring
 from ...typing import pytree
 from .._assembly import float32
-from .._effect import Clock, Prepared
+from .._effect import Clock, Prepared, Step
 
 # Cost of one more loop, including its compilation, as a share of all elements.
 _LOOP = 0.12
@@ -249,9 +249,9 @@ class Colored(Prepared, abc.ABC):
         start: Array,
         context: tuple,
         progress: Array,
-        step: tuple[float, float],
+        step: Step,
     ) -> Array:
-        h = step[0]
+        h = step.length
 
         def move(rows: list[Array], known: tuple) -> list[Array]:
             weight, law, edges = known

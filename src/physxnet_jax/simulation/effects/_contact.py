@@ -12,12 +12,13 @@ from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES, Body, triangulate
 from ...errors import check_counts, check_numbers
-from ...geometry import closest_barycentric, spread_points, vertex_normals
+from ...geometry import closest_barycentric, fast_argmin, spread_points, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints
+from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints, Step
 from ._limbs import LOWER_ARMS, TRUNK, UPPER_ARMS, limb_labels
 from ._pinch import ROOM, Pinch, prepare_pinch
+from ._samples import Samples, sample_faces
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,7 +37,11 @@ class BodyContact(Effect):
     if the flesh were compressed, and its vertices are counted (``pinched``). Loose cloth
     doesn't track but compares a list of patches on all limbs within reach.
 
+    Edges and faces of the cloth larger than ``sample_spacing`` are kept off the skin at sample
+    points as well, so that no skin comes through a large triangle.
+
     Attributes:
+        sample_spacing: Largest distance between points of the cloth that feel contact [m].
         patch: Number of triangles around the nearest skin vertex that are compared exactly.
         ring: Number of skin vertices that each step of the walk compares.
         hops: Steps of the walk per contact interval; each covers about two centimetres.
@@ -52,6 +57,7 @@ class BodyContact(Effect):
         move, Mueller et al., Position based dynamics (2007), section 3.4.
     """
 
+    sample_spacing: float = 0.03
     patch: int = 12
     ring: int = 16
     hops: int = 3
@@ -62,11 +68,14 @@ class BodyContact(Effect):
 
     def __post_init__(self) -> None:
         check_counts(self, "patch", "ring", "hops", "centres")
-        check_numbers(self, "spacing", "push")
+        check_numbers(self, "sample_spacing", "spacing", "push")
         check_numbers(self, "leave", zero=True)
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Builds patches around skin vertices and the first skin vertex of each search."""
+        samples = sample_faces(assembly.rest, assembly.faces, self.sample_spacing)
+        free = np.asarray(inverse_mass) > 0
+        assembly = _with_samples(assembly, samples)
         body = assembly.body
         skin = assembly.rest_body[:NUM_BODY_VERTICES]
         faces = np.asarray(triangulate(body.quads))
@@ -92,10 +101,10 @@ class BodyContact(Effect):
         skinned_points = SkinnedPoints(
             float32(skin[used]), normals[jnp.asarray(used)], body.weights[jnp.asarray(used)]
         )
-        w = np.asarray(inverse_mass)
         return _Contact(
+            samples,
             skinned_points,
-            jnp.asarray(ring.reshape(len(used), -1).astype(np.int32)),
+            jnp.asarray(ring.reshape(len(used), -1).T.astype(np.int32)),
             jnp.asarray(near.T.astype(np.int32)),
             jnp.asarray(np.moveaxis(local[faces[kept]][near], 0, 2)),
             float32(far[:, -1]),
@@ -104,10 +113,10 @@ class BodyContact(Effect):
             jnp.asarray(loose.astype(np.int32)),
             jnp.asarray(np.argsort(np.concatenate([tight, loose])).astype(np.int32)),
             jnp.asarray(local[start]),
-            jnp.asarray(local[listed]),
+            jnp.asarray(local[listed].T),
             float32(assembly.thickness[:, None]),
             float32(assembly.friction[:, None]),
-            float32((w > 0)[:, None]),
+            float32(free[:, None]),
             prepare_pinch(skin[used], np.asarray(skinned_points.normals), weights[used], body),
             jnp.asarray(assembly.loose[:, None]),
             self.push,
@@ -124,6 +133,29 @@ _COVER = 0.002
 _NEAR = 0.001
 # Skin farther than this from all cloth at rest is left out [m].
 _REACH = 0.30
+
+
+def _with_samples(assembly: Assembly, samples: Samples) -> Assembly:
+    """The vertices with the samples after them, for everything that contact needs of them."""
+    corners, weights = np.asarray(samples.corners), np.asarray(samples.weights)
+
+    def more(x: np.ndarray) -> np.ndarray:
+        there = np.einsum("ks,ks...->s...", weights, x[corners])
+        return np.concatenate([x, there.astype(x.dtype)])
+
+    def some(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([x, x[corners].any(axis=0)])
+
+    return dataclasses.replace(
+        assembly,
+        rest=more(assembly.rest),
+        mass=more(assembly.mass),
+        pinned=some(assembly.pinned),
+        weights=more(assembly.weights),
+        thickness=more(assembly.thickness),
+        friction=more(assembly.friction),
+        loose=some(assembly.loose),
+    )
 
 
 def _starting_vertices(
@@ -169,45 +201,66 @@ def _limbs(weights: Float[np.ndarray, "points joints"], body: Body) -> Int[np.nd
 
 @pytree
 @dataclasses.dataclass(frozen=True)
-class _Touch:
-    """Contacts of all cloth vertices with the skin in a contact interval.
+class _Surface:
+    """The skin beside each vertex and sample during a contact interval.
 
     Attributes:
-        where: Vector from the cloth vertex to its skin point at the start [m].
+        where: Vector from the cloth to its skin point at the start [m].
         way: Motion of the skin point during the interval [m].
         normal: Skin normal at the start, not normalised.
         turn: Change of the normal during the interval.
-        centre: Skin vertices at which the next search starts.
-        room: Gap at each skin vertex at the end, see `Pinch.room`.
-        missed: Whether the closest point may lie beyond the patch.
-        unit: Unit normal at the start.
-        ceiling: Maximum outward speed of touching cloth [m/s].
         height: Minimum height above the skin at the start [m].
         rise: Change of the minimum height during the interval [m].
         top: Maximum height above the skin at the start, due to another limb [m].
         fall: Change of the maximum height during the interval [m].
     """
 
-    where: Float[Array, "vertices 3 batch"]
-    way: Float[Array, "vertices 3 batch"]
-    normal: Float[Array, "vertices 3 batch"]
-    turn: Float[Array, "vertices 3 batch"]
+    where: Float[Array, "points 3 batch"]
+    way: Float[Array, "points 3 batch"]
+    normal: Float[Array, "points 3 batch"]
+    turn: Float[Array, "points 3 batch"]
+    height: Float[Array, "points 1 batch"]
+    rise: Float[Array, "points 1 batch"]
+    top: Float[Array, "points 1 batch"]
+    fall: Float[Array, "points 1 batch"]
+
+    def height_of(self, displacement: Array, progress: Array) -> tuple[Array, Array]:
+        """Unit normals, and heights above the skin [m]."""
+        n = self.normal + progress * self.turn
+        n = n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-12)
+        gap = displacement - (self.where + progress * self.way)
+        return n, jnp.sum(gap * n, axis=1, keepdims=True)
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class _Touch:
+    """Contacts of all cloth vertices and samples with the skin in a contact interval.
+
+    Attributes:
+        surface: The skin beside them.
+        centre: Skin vertices at which the next search starts.
+        room: Gap at each skin vertex at the end, see `Pinch.room`.
+        missed: Whether the closest point may lie beyond the patch.
+        unit: Unit normal at the start.
+        ceiling: Maximum outward speed of touching cloth [m/s].
+    """
+
+    surface: _Surface
     centre: Int[Array, "tight batch"]
     room: Float[Array, "skin batch"]
-    missed: Bool[Array, "vertices batch"]
-    unit: Float[Array, "vertices 3 batch"]
-    ceiling: Float[Array, "vertices 1 batch"]
-    height: Float[Array, "vertices 1 batch"]
-    rise: Float[Array, "vertices 1 batch"]
-    top: Float[Array, "vertices 1 batch"]
-    fall: Float[Array, "vertices 1 batch"]
+    missed: Bool[Array, "points batch"]
+    unit: Float[Array, "points 3 batch"]
+    ceiling: Float[Array, "points 1 batch"]
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Contact(Prepared):
+    unilateral = True
+    samples: Samples
     skin: SkinnedPoints
-    ring: Int[Array, "skin ring"]
+    ring: Int[Array, "ring skin"]
     table: Int[Array, "patch skin"]
     corners: Int[Array, "patch 3 skin"]
     radius: Float[Array, " skin"]
@@ -216,7 +269,7 @@ class _Contact(Prepared):
     loose: Int[Array, " loose"]
     order: Int[Array, " vertices"]
     start: Int[Array, " tight"]
-    listed: Int[Array, "loose k"]
+    listed: Int[Array, "k loose"]
     thickness: Float[Array, "vertices 1"]
     friction: Float[Array, "vertices 1"]
     free: Float[Array, "vertices 1"]
@@ -251,14 +304,9 @@ class _Contact(Prepared):
         at: Int[Array, "some batch"],
     ) -> Int[Array, "some batch"]:
         """Moves ``hops`` times to the nearest skin vertex of the current vertex's ring."""
-        lane = jnp.arange(points.shape[2])[None, :, None]
-        p = jnp.moveaxis(points, 1, 2)[:, :, None]
 
         def hop(_: Array, at: Array) -> Array:
-            ring = self.ring[at]
-            gap = skin[ring, :, lane] - p
-            best = jnp.argmin(jnp.sum(gap * gap, axis=3), axis=2)
-            return jnp.take_along_axis(ring, best[..., None], axis=2)[..., 0]
+            return _pick(points, skin, self.ring[:, at])
 
         return jax.lax.fori_loop(0, self.hops, hop, at)
 
@@ -292,6 +340,7 @@ class _Contact(Prepared):
         clock: Clock,
         state: tuple[Array, Array],
     ) -> _Touch:
+        base = self.samples.extend(base)
         stop = jax.lax.stop_gradient
         points = stop(start.points)
         centre, room = state
@@ -299,10 +348,9 @@ class _Contact(Prepared):
         last = centre
         if self.loose.shape[0]:
             loose = stop(base[self.loose])
-            gap = points[self.listed] - loose[:, None]
-            pick = jnp.argmin(jnp.sum(gap * gap, axis=2), axis=1)
-            there = jnp.take_along_axis(self.listed, pick, axis=1)
-            there = self.walk(loose, points, there)
+            listed = self.listed[..., None]
+            listed = jnp.broadcast_to(listed, (*self.listed.shape, loose.shape[2]))
+            there = self.walk(loose, points, _pick(loose, points, listed))
             last = jnp.concatenate([centre, there])[self.order]
         face, weights = self.closest(base, start.points, last)
         p0, n0 = _surface(start, self.faces, face, weights)
@@ -319,7 +367,8 @@ class _Contact(Prepared):
         fastest = jnp.sum((p1 - p0) * unit, axis=1, keepdims=True) / clock.length + self.leave
         ceiling = jnp.where(touching, fastest, jnp.inf)
         heights = wanted, rise - wanted, top, fall - top
-        return _Touch(p0 - base, p1 - p0, n0, n1 - n0, centre, later, far, unit, ceiling, *heights)
+        surface = _Surface(p0 - base, p1 - p0, n0, n1 - n0, *heights)
+        return _Touch(surface, centre, later, far, unit, ceiling)
 
     def _height_bounds(self, room: Array, face: Array, weights: Array) -> tuple[Array, Array]:
         """Minimum and maximum height above the skin [m], equal where limbs leave no gap."""
@@ -339,7 +388,7 @@ class _Contact(Prepared):
         return low, jnp.maximum(there - outermost - under, low)
 
     def accelerate(self, velocity: Array, context: _Touch, h: float) -> Array:
-        unit, ceiling = context.unit, context.ceiling
+        unit, ceiling = context.unit[: len(velocity)], context.ceiling[: len(velocity)]
         outwards = jnp.sum(velocity * unit, axis=1, keepdims=True)
         return velocity - jnp.maximum(outwards - ceiling, 0.0) * unit
 
@@ -349,35 +398,51 @@ class _Contact(Prepared):
         start: Array,
         context: _Touch,
         progress: Array,
-        step: tuple[float, float],
+        step: Step,
     ) -> Array:
-        n, height = self._height(displacement, context, progress)
+        vertices = len(displacement)
+        own = jax.tree.map(lambda x: x[:vertices], context.surface)
+        moved, _ = self._pushed(displacement, start, own, progress, step, slice(vertices))
+        moved = displacement + (moved - displacement) * self.free[..., None]
+        if self.samples.count:
+            rest = jax.tree.map(lambda x: x[vertices:], context.surface)
+            at = self.samples.points(moved)
+            pushed, lift = self._pushed(
+                at, self.samples.points(start), rest, progress, step, slice(vertices, None)
+            )
+            moved = self.samples.push(moved, pushed - at, lift != 0, self.free)
+        return moved
+
+    def _pushed(
+        self,
+        displacement: Array,
+        start: Array,
+        context: "_Surface",
+        progress: Array,
+        step: Step,
+        points: slice,
+    ) -> tuple[Array, Array]:
+        """Displacements of points after contact and friction, and how far they were lifted [m]."""
+        n, height = context.height_of(displacement, progress)
         low = context.height + progress * context.rise
         high = context.top + progress * context.fall
-        slowest = -self.leave * step[0]
+        slowest = -self.leave * step.length
         lift = jnp.clip(jnp.clip(height, low, high) - height, slowest, self.push)
         # Without a maximum height, cloth above the skin is free.
         lift = jnp.where(high > 0.9 * _FREE, jnp.maximum(lift, 0.0), lift)
-        lift = lift * self.free[..., None]
         moved = displacement + lift * n
         # Friction opposes the motion relative to the skin in this substep.
-        slide = (moved - start) - step[1] * context.way
+        slide = (moved - start) - step.share * context.way
         slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
         length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
-        hold = jnp.minimum(1.0, self.friction[..., None] * jnp.abs(lift) / length)
-        return moved - hold * slide
-
-    def _height(self, displacement: Array, context: _Touch, progress: Array) -> tuple[Array, Array]:
-        """Unit normals, and heights above the skin [m]."""
-        n = context.normal + progress * context.turn
-        n = n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-12)
-        gap = displacement - (context.where + progress * context.way)
-        return n, jnp.sum(gap * n, axis=1, keepdims=True)
+        hold = jnp.minimum(1.0, self.friction[points][..., None] * jnp.abs(lift) / length)
+        return moved - hold * slide, lift
 
     def diagnose(self, displacement: Array, context: _Touch) -> dict[str, Array]:
-        height = self._height(displacement, context, jnp.ones((), displacement.dtype))[1]
+        points = self.samples.extend(displacement)
+        height = context.surface.height_of(points, jnp.ones((), displacement.dtype))[1]
         # Depth below the skin or, in a pinch, below a thickness under its middle.
-        wanted = context.height + context.rise
+        wanted = context.surface.height + context.surface.rise
         inside = (wanted - self.thickness[..., None] - height)[:, 0]
         return {
             "penetration_max": jnp.maximum(inside.max(axis=0), 0.0),
@@ -386,6 +451,20 @@ class _Contact(Prepared):
             "missed": jnp.sum(context.missed & (inside > -0.02), axis=0),
             "pinched": jnp.sum(wanted[:, 0] < 0, axis=0),
         }
+
+
+def _pick(
+    points: Float[Array, "some 3 batch"],
+    skin: Float[Array, "skin 3 batch"],
+    candidates: Int[Array, "candidates some batch"],
+) -> Int[Array, "some batch"]:
+    """The nearest of each point's candidates among the skin vertices."""
+    batch = points.shape[2]
+    flat = candidates * batch + jnp.arange(batch, dtype=jnp.int32)[None, None]
+    gaps = [skin[:, i].reshape(-1)[flat] - points[None, :, i] for i in range(3)]
+    gap = gaps[0] ** 2 + gaps[1] ** 2 + gaps[2] ** 2
+    best = fast_argmin(gap.reshape(len(gap), -1), axis=0).reshape(1, *gap.shape[1:])
+    return jnp.take_along_axis(candidates, best, axis=0)[0]
 
 
 def _surface(skin: PosedPoints, faces: Array, face: Array, weights: Array) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ from .._effect import Effect, Prepared
 
 @dataclasses.dataclass(frozen=True)
 class Damping(Effect):
-    """``dv/dt = -rate v``, integrated exactly.
+    """``dv/dt = -rate v``: each step multiplies velocities by the exact decay over its length.
 
     Attributes:
         rate: Decay rate [1/s]. One per second corresponds to light cotton that moves at

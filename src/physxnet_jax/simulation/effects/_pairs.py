@@ -8,7 +8,7 @@ from jaxtyping import Array, Float, Int
 
 from ...geometry import closest_barycentric
 from ...typing import pytree
-from .._effect import Clock, Prepared
+from .._effect import Clock, Prepared, Step
 
 
 @pytree
@@ -80,6 +80,7 @@ class Spacing(Protocol):
 class ClothContact(Prepared):
     """Base class of contact of cloth with cloth; `begin` of subclasses finds the pairs."""
 
+    unilateral = True
     inverse_mass: Float[Array, "vertices 1 1"]
     law: Spacing
 
@@ -92,7 +93,7 @@ class ClothContact(Prepared):
         start: Array,
         context: Facing,
         progress: Array,
-        step: tuple[float, float],
+        step: Step,
     ) -> Array:
         return separate_pairs(
             displacement, start, context.pairs, self.inverse_mass, self.law, context.clock, progress

@@ -9,7 +9,7 @@ from jaxtyping import Array, Int
 
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints
+from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints, Step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +49,7 @@ class _Pin(Prepared):
         start: Array,
         context: tuple[Array, Array],
         progress: Array,
-        step: tuple[float, float],
+        step: Step,
     ) -> Array:
         offset, motion = context
         return displacement.at[self.index].set(offset + progress * motion, unique_indices=True)

@@ -2,14 +2,13 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ...body import HANDS, Body, body_segments
-from ...geometry import spread_points
+from ...geometry import fast_argmin, spread_points
 from ...typing import pytree
 from .._assembly import float32
 from .._effect import PosedPoints
@@ -22,8 +21,6 @@ _MIN_REST_DISTANCE = 0.06
 _MIN_REST_GAP = 0.01
 # Skin deeper than this below facing skin lies on the far side of a limb [m].
 _MAX_DEPTH = 0.06
-# Positions are taken relative to the nearest point of a grid with this spacing [m].
-_GRID_SPACING = 16.0
 # Lateral reach of the test at rest that detects the far side of a limb [m].
 _LATERAL_REACH = 0.08
 # Larger gaps aren't pinches [m].
@@ -53,18 +50,13 @@ class Pinch:
         Negative where the body intersects itself.
         """
         p, n = skin.points[self.samples], skin.normals[self.samples]
-        stop = jax.lax.stop_gradient
-        # Far from the origin, squares of coordinates would cancel with loss of precision.
-        p = p - stop(_GRID_SPACING * jnp.round(jnp.mean(p, axis=0, keepdims=True) / _GRID_SPACING))
-        squared = jnp.sum(p * p, axis=1)
-        # A point's own squared length doesn't change which sample is the nearest.
-        gap = squared[None] - 2.0 * jnp.einsum(
-            "sib,tib->stb", stop(p), stop(p), precision=jax.lax.Precision.HIGHEST
-        )
-        nearest = jnp.argmin(jnp.where(self.facing[..., None], gap, jnp.inf), axis=1)
-        lane = jnp.arange(p.shape[2], dtype=nearest.dtype)[None]
-        away = p - jnp.moveaxis(p[nearest, :, lane], -1, 1)
-        normal = jnp.moveaxis(n[nearest, :, lane], -1, 1)
+        gaps = [p[None, :, i] - p[:, None, i] for i in range(3)]
+        gap = gaps[0] ** 2 + gaps[1] ** 2 + gaps[2] ** 2
+        gap = jnp.where(self.facing.T[..., None], gap, jnp.inf)
+        closest = fast_argmin(gap.reshape(len(gap), -1), axis=0).reshape(gap.shape[1:])
+        lane = jnp.arange(p.shape[2])[None]
+        away = p - jnp.moveaxis(p[closest, :, lane], -1, 1)
+        normal = jnp.moveaxis(n[closest, :, lane], -1, 1)
         height = jnp.sum(away * normal, axis=1)
         beside = jnp.sum(away * away, axis=1) - height**2
         opposed = jnp.sum(n * normal, axis=1) < 0

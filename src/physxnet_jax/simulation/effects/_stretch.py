@@ -12,7 +12,8 @@ from ...errors import check_numbers
 from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly
-from .._effect import Clock, Effect, Prepared
+from .._effect import Clock, Effect, Prepared, Step
+from .._quantile import upper_quantile
 from ._colored import ColorGroup, bundled, color_groups, column, directed, sweep
 
 
@@ -101,9 +102,9 @@ class _Stretch(Prepared):
         start: Array,
         context: tuple,
         progress: Array,
-        step: tuple[float, float],
+        step: Step,
     ) -> Array:
-        h = step[0]
+        h = step.length
 
         def move(rows: list[Array], known: tuple) -> list[Array]:
             (da, db), (edge, (wa, wb), rest, compliance) = rows, known
@@ -147,4 +148,4 @@ class _Stretch(Prepared):
     def diagnose(self, displacement: Array, context: tuple) -> dict[str, Array]:
         span, rest = self._spans(displacement, context), self.springs.length[:, 0]
         every = (jnp.sqrt(jnp.sum(span * span, axis=1)) - rest) / jnp.maximum(rest, 1e-4)
-        return {"strain_max": every.max(axis=0), "strain_p99": jnp.quantile(every, 0.99, axis=0)}
+        return {"strain_max": every.max(axis=0), "strain_p99": upper_quantile(every, 0.99)}

@@ -1,0 +1,90 @@
+"""What one sees at a glance: skin through cloth, and cloth through itself."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ..body import NUM_BODY_VERTICES, triangulate
+from ..geometry import (
+    cast_rays,
+    make_mesh,
+    self_intersections,
+    vertex_normals,
+    visible_skin,
+)
+from ..motion import Motion, animate
+from ..simulation import Assembly
+
+# Skin below cloth at rest, as far away as this along its normal, is covered [m].
+_COVER = 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class SurfaceFaults:
+    """Faults of the surface of a dressed person.
+
+    Attributes:
+        visible_skin: Share of pixels that show skin which came through the cloth over it, see
+            `physxnet_jax.geometry.visible_skin`.
+        self_crossing: Share of faces that cross other faces of the same garment.
+    """
+
+    visible_skin: float
+    self_crossing: float
+
+
+def surface_faults(
+    assembly: Assembly,
+    motion: Motion,
+    positions: Float[np.ndarray, "frames vertices 3"],
+    *,
+    frames: Int[np.ndarray, " looked"] | None = None,
+) -> SurfaceFaults:
+    """Measures visible skin and self-crossing, on meshes alone.
+
+    Args:
+        assembly: The scene's garments and body.
+        motion: The body's motion.
+        positions: Vertices of all garments [m].
+        frames: Frames to look at; all by default.
+
+    Returns:
+        Shares over these frames.
+    """
+    looked = np.arange(len(positions)) if frames is None else np.asarray(frames)
+    body = assembly.body
+    faces = np.asarray(triangulate(body.quads))
+    rest = jnp.asarray(assembly.rest_body, jnp.float32)
+    part = Motion(
+        jnp.asarray(motion.rotations)[looked], jnp.asarray(motion.root)[looked], motion.fps
+    )
+    weights = jnp.asarray(body.weights[:NUM_BODY_VERTICES])
+    skin = np.asarray(animate(body, rest, rest[:NUM_BODY_VERTICES], weights, part))
+    counted = _covered_faces(assembly, faces)
+    bounds = list(zip(assembly.parts, assembly.parts[1:]))
+    owner = np.searchsorted(assembly.parts, assembly.faces[:, 0], side="right") - 1
+    garments = [assembly.faces[owner == k] - i for k, (i, _) in enumerate(bounds)]
+    through = covered = crossing = 0
+    for s, x in zip(skin, positions[looked], strict=True):
+        cloth = [(x[i:j], f) for (i, j), f in zip(bounds, garments, strict=True)]
+        seen = visible_skin(s, faces, cloth, counted=counted)
+        through, covered = through + seen.through, covered + seen.covered
+        crossing += sum(len(np.unique(self_intersections(*mesh)[:, 1])) for mesh in cloth)
+    return SurfaceFaults(
+        through / max(through + covered, 1), crossing / max(len(looked) * len(owner), 1)
+    )
+
+
+def _covered_faces(
+    assembly: Assembly, faces: Int[np.ndarray, "faces 3"]
+) -> Bool[np.ndarray, " faces"]:
+    """Triangles of the skin with cloth over them at rest."""
+    skin = jnp.asarray(assembly.rest_body[:NUM_BODY_VERTICES], jnp.float32)
+    normals = vertex_normals(skin, jnp.asarray(faces))
+    cloth = make_mesh(assembly.rest, assembly.faces)
+    # From a little below: cloth may rest on the skin or in it.
+    hits = cast_rays(cloth, skin - 0.01 * normals, normals, max_distance=_COVER)
+    over: Bool[np.ndarray, "faces 3"] = np.asarray(hits.valid)[faces]
+    return np.logical_or.reduce(over, axis=1)
