@@ -11,15 +11,24 @@ import pytest
 
 from physxnet_jax.cli import main
 from physxnet_jax.cli._progress import print_json
-from physxnet_jax.dressing import Inference, Simulation, load_scene, make_dresser, make_scene
+from physxnet_jax.dressing import (
+    Inference,
+    Simulation,
+    load_scene,
+    make_dresser,
+    make_scene,
+    write_scene,
+)
 from physxnet_jax.errors import (
+    FormatError,
     MissingDependencyError,
     MotionError,
     PhysXNetError,
     SimulationError,
 )
 from physxnet_jax.evaluation import price_effects, recommend_effects
-from physxnet_jax.garment import square_sheet, template
+from physxnet_jax.evaluation._price import Price
+from physxnet_jax.garment import FABRICS, square_sheet, template
 from physxnet_jax.io import write_obj
 from physxnet_jax.motion import body_animation, load_motion
 from physxnet_jax.simulation import XPBD, Effect, Rollout, Scene, prepare_scene, simulate_batch
@@ -275,7 +284,7 @@ def test_effect_costs_separate_relevant_from_irrelevant_effects(tmp_path, capsys
     advice = {a.effect: a for a in recommend_effects(scene, motion, solver=solver, rows=rows)}
     assert advice["Gravity"].needed and advice["Pin"].needed
     assert not advice["BodyContact"].needed
-    assert not advice["SelfContact"].needed and "never comes within" in advice["SelfContact"].why
+    assert not advice["SelfContact"].needed and "Cloth never comes" in advice["SelfContact"].why
 
 
 @pytest.mark.release
@@ -300,6 +309,43 @@ def test_effects_command_prints_and_writes_its_table(tmp_path, capsys, monkeypat
     assert data[2]["mflop"] < data[0]["mflop"] and data[1]["rms_mm"] > 100
     assert main(["effects", str(path), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["effects"] == data
+    assert data[0]["jitter_mm"] == data[2]["jitter_mm"] > 0
+
+
+@pytest.mark.release
+def test_recommended_scene_is_written_and_simulated(tmp_path, capsys):
+    needed = tmp_path / "needed.toml"
+    words = ["effects", "balance", "--wear", "bottom:fabric=silk", "--frames", "2"]
+    words += ["--accuracy", "draft", "--recommend", "--write-scene", str(needed)]
+    assert main(words) == 0
+    assert "Gravity: needed" in capsys.readouterr().out
+    scene = load_scene(needed)
+    kinds = {type(e) for e in scene.scene.effects}
+    assert {Gravity, Pin} <= kinds and scene.accuracy == "draft"
+    assert (
+        scene.scene.garments[0].fabric.bend == FABRICS["silk"].bend and scene.motion.num_frames == 2
+    )
+    assert main(["effects", "balance", "--write-scene", str(needed)]) == 2
+    assert "add --recommend" in capsys.readouterr().err
+
+
+def test_changes_below_the_noise_floor_are_no_measurable_effect():
+    scene = Scene((template("bottom"),), (Gravity(), BodyContact(), Pin()))
+    motion = load_motion("balance", fps=30.0)
+    base = Price("", 2, 0.0, 0.0, 0.1, 0.0, 10.0, 1.0, 1.0, 6.0)
+    rows = [
+        base,
+        *(dataclasses.replace(base, without=n, rms_mm=m) for n, m in (("A", 5.0), ("B", 7.0))),
+    ]
+    below, above = recommend_effects(scene, motion, solver=XPBD(1, 1), rows=rows)[:2]
+    assert not below.needed and below.why.startswith("No measurable effect")
+    assert above.needed and "No measurable" not in above.why
+
+
+def test_scene_of_objects_in_memory_is_not_written(tmp_path):
+    scene = make_scene(load_motion("balance", fps=30.0), ["bottom"])
+    with pytest.raises(FormatError, match="objects in memory"):
+        write_scene(tmp_path / "a.toml", scene, ())
 
 
 def test_missing_blender_error_names_the_environment_variable(monkeypatch):

@@ -78,7 +78,7 @@ class Effects:
 
     Examples:
       physxnet effects walk --wear top --frames 20
-      physxnet effects scene.toml --recommend -o effects.json
+      physxnet effects scene.toml --recommend --write-scene needed.toml
     """
 
     scene: tyro.conf.Positional[str]
@@ -87,6 +87,8 @@ class Effects:
     """Report which effects matter, including those that the scene doesn't have."""
     tolerance: float = 2.0
     """Differences below this are ignored [mm]."""
+    write_scene: pathlib.Path | None = None
+    """With --recommend: write the recommended scene to this file (.toml)."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Write the rows to this file, as JSON."""
     source: MotionSource = dataclasses.field(default_factory=lambda: MotionSource(frames=20))

@@ -28,7 +28,11 @@ from ._inspect import Inspection as Inspection, inspect_garment as inspect_garme
 from ._meshes import animated_meshes as animated_meshes
 from ._pipeline import infer_block as infer_block
 from ._repair import fit_garment as fit_garment
-from ._scene_file import load_scene as load_scene, make_scene as make_scene
+from ._scene_file import (
+    load_scene as load_scene,
+    make_scene as make_scene,
+    write_scene as write_scene,
+)
 from ._simulate import (
     EXTERNAL_ENGINES as EXTERNAL_ENGINES,
     Simulation as Simulation,

@@ -1,17 +1,18 @@
 """Scenes, from TOML files or arguments: motion, garments, effects, accuracy."""
 
 import dataclasses
+import json
 import pathlib
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from jaxtyping import Array, Float
 
 from ..body import load_body
 from ..errors import FormatError
-from ..files import is_file
-from ..garment import FABRICS, parse_wear, with_fabric
+from ..files import atomic_write, is_file
+from ..garment import FABRICS, Garment, parse_wear, with_fabric
 from ..io import split_part
 from ..motion import Motion, prepare_motion, sudden_turns
 from ..simulation import EFFECTS, PRESETS, Accuracy, Effect, Scene
@@ -45,6 +46,8 @@ class SceneFile:
         motion: The body's motion.
         accuracy: ``draft``, ``standard``, ``fine`` or ``reference``.
         lists_effects: Whether a file lists effects.
+        keys: Keys of a scene file that state the motion and the garments; empty if they were
+            given as objects.
         notes: Remarks on the motion and on garments read from files.
     """
 
@@ -53,6 +56,66 @@ class SceneFile:
     accuracy: Accuracy = "standard"
     notes: tuple[str, ...] = ()
     lists_effects: bool = False
+    keys: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def write_scene(path: str | pathlib.Path, scene_file: SceneFile, effects: Sequence[Effect]) -> None:
+    """Writes a scene file that lists all its effects; `load_scene` reads it.
+
+    Args:
+        path: The file (.toml).
+        scene_file: A scene made of names and files.
+        effects: The effects to write in place of the scene's.
+
+    Raises:
+        FormatError: The scene was made of objects in memory.
+    """
+    if not scene_file.keys:
+        raise FormatError("A scene of objects in memory can't be written; name clips and files.")
+    keys = {**scene_file.keys, "accuracy": scene_file.accuracy}
+    tables = {k: v for k, v in keys.items() if isinstance(v, dict)}
+    lines = [f"{k} = {json.dumps(v)}" for k, v in keys.items() if k not in tables | {"garments": 0}]
+    for garment in keys["garments"]:
+        lines += ["", "[[garments]]", *(f"{k} = {json.dumps(v)}" for k, v in garment.items())]
+    names = {kind: name for name, kind in EFFECTS.items()}
+    for name, table in tables.items():
+        lines += ["", f"[{name}]", *(f"{k} = {json.dumps(v)}" for k, v in table.items())]
+    for e in effects:
+        lines += ["", f"[effects.{names[type(e)]}]"]
+        for field in dataclasses.fields(e):
+            value = getattr(e, field.name)
+            if value != field.default and value is not None:
+                lines.append(f"{field.name} = {json.dumps(value)}")
+    with atomic_write(path) as part:
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _scene_keys(
+    motion: str | pathlib.Path | Motion, wear: Wear, options: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Keys of a scene file for names and files, with absolute paths; empty for objects."""
+    if isinstance(motion, Motion) or isinstance(wear, Garment):
+        return {}
+    every = [wear] if isinstance(wear, str | pathlib.Path) else list(wear)
+    words = [w for w in every if not isinstance(w, Garment)]
+    if len(words) < len(every):
+        return {}
+
+    def absolute(word: str | pathlib.Path) -> str:
+        name = str(word)
+        at = pathlib.Path(split_part(pathlib.Path(name))[0])
+        return str(pathlib.Path(name).absolute()) if is_file(at) else name
+
+    garments = []
+    for w in words:
+        item = parse_wear(w)
+        file = absolute(item.name) + (f":as={item.template}" if item.template else "")
+        garments.append({"file": file} | ({"fabric": item.fabric} if item.fabric else {}))
+    keys = {"motion": absolute(motion), "garments": garments}
+    for name, value in options.items():
+        if value is not None:
+            keys[name] = absolute(value) if isinstance(value, str | pathlib.Path) else value
+    return keys
 
 
 def make_scene(
@@ -103,7 +166,21 @@ def make_scene(
     garments, notes = resolve_garments(wear, body)
     scene = build_scene(garments, body, shape, simulation, also)
     fault = sudden_turns(body, clip)
-    return SceneFile(scene, clip, simulation.accuracy, notes if fault is None else (fault, *notes))
+    options = {
+        "fps": fps,
+        "start": start,
+        "frames": frames,
+        "source_fps": source_fps,
+        "skeleton": skeleton,
+        "joint_map": joint_map,
+    }
+    return SceneFile(
+        scene,
+        clip,
+        simulation.accuracy,
+        notes if fault is None else (fault, *notes),
+        keys={} if shape is not None else _scene_keys(motion, wear, options),
+    )
 
 
 def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneFile:
@@ -159,8 +236,18 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         shape=load_body().shape(**text["shape"]) if "shape" in text else None,
         also=_parse_effects(path, text.get("also", {})),
     )
+    files = [
+        f"{_resolve_path(path, g['file'])}" + (f":fabric={g['fabric']}" if "fabric" in g else "")
+        for g in words
+    ]
+    options = {
+        k: _resolve_path(path, v) if k in ("skeleton", "joint_map") else v
+        for k, v in text.items()
+        if k in ("fps", "start", "frames", "source_fps", "skeleton", "joint_map", "shape")
+    }
     return dataclasses.replace(
         scene_file,
+        keys=_scene_keys(_resolve_path(path, text["motion"]), files, options),
         notes=(*scene_file.notes, *notes),
         lists_effects="effects" in text or "also" in text,
     )

@@ -72,7 +72,11 @@ from ._network_bench import (
     evaluated_errors as evaluated_errors,
 )
 from ._penetration import penetration as penetration
-from ._price import price_effects as price_effects, recommend_effects as recommend_effects
+from ._price import (
+    price_effects as price_effects,
+    recommend_effects as recommend_effects,
+    recommended_effects as recommended_effects,
+)
 from ._saved_rows import (
     check_rows_file as check_rows_file,
     machine as machine,

@@ -45,6 +45,8 @@ class Price:
         mflop: Floating-point operations of the program as counted by XLA, which counts
             every loop's body once: a frame of one contact interval of one substep [Mflop].
         cold_s: Time of the first frames, including compilation [s].
+        jitter_mm: RMS distance of the whole scene's cloth from that of a root moved by 1e-6 m in
+            each frame [mm]: smaller changes can't be measured.
     """
 
     without: str
@@ -56,6 +58,7 @@ class Price:
     ms_per_frame: float
     mflop: float
     cold_s: float
+    jitter_mm: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,11 +69,35 @@ class Advice:
         effect: Name of the effect.
         needed: Whether it changes the cloth by more than the tolerance.
         why: The measurements, as text.
+        added: The effect, if the scene lacks it.
     """
 
     effect: str
     needed: bool
     why: str
+    added: Effect | None = None
+
+
+def recommended_effects(scene: Scene, advice: Sequence[Advice]) -> tuple[Effect, ...]:
+    """The effects of a scene without those that aren't needed, and with those that are.
+
+    Args:
+        scene: The scene.
+        advice: Result of `recommend_effects`.
+    """
+    unneeded = {a.effect for a in advice if not a.needed}
+    effects = tuple(e for e in scene.effects if type(e).__name__ not in unneeded)
+    for a in advice:
+        if a.needed and a.added is not None:
+            effects = _with_effect(effects, a.added)
+    return effects
+
+
+def _with_effect(effects: tuple[Effect, ...], added: Effect) -> tuple[Effect, ...]:
+    """Effects with one more, before contact with the body; air replaces damping."""
+    kept = tuple(e for e in effects if not (isinstance(added, Air) and isinstance(e, Damping)))
+    at = next((i for i, e in enumerate(kept) if isinstance(e, BodyContact)), len(kept))
+    return (*kept[:at], added, *kept[at:])
 
 
 def price_effects(
@@ -97,12 +124,14 @@ def price_effects(
     ]
     rows: list[Price] = []
     whole: Rollout | None = None
+    floor = 0.0
     for k, (name, effects) in enumerate(variants):
         row, rollout = _measure(
             dataclasses.replace(scene, effects=effects), motion, solver, whole, name
         )
-        whole = rollout if whole is None else whole
-        rows.append(row)
+        if whole is None:
+            whole, floor = rollout, _noise_floor(scene, motion, solver, rollout)
+        rows.append(dataclasses.replace(row, jitter_mm=floor))
         # The program of these effects is never run again.
         advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
         if progress is not None:
@@ -138,12 +167,13 @@ def recommend_effects(
     for r in rows[1:]:
         inside = r.inside_share - base.inside_share
         strain = r.strain_p99 - base.strain_p99
-        needed = r.rms_mm > 1e3 * tolerance or inside > 1e-3 or strain > 0.05
+        needed = r.rms_mm > max(1e3 * tolerance, r.jitter_mm) or inside > 1e-3 or strain > 0.05
+        seen = "" if r.rms_mm > r.jitter_mm else "No measurable effect. "
         out.append(
             Advice(
                 r.without,
                 needed,
-                f"Without it the cloth moves by {r.rms_mm:.1f} mm (inside the body"
+                f"{seen}Without it the cloth moves by {r.rms_mm:.1f} mm (inside the body"
                 f" {100 * inside:+.1f} %, strain {100 * strain:+.0f} %); it costs"
                 f" {base.ms_per_frame - r.ms_per_frame:.1f} ms a frame.",
             )
@@ -158,23 +188,17 @@ def recommend_effects(
     for k, e in enumerate(extra):
         if whole is None:
             whole = _measure(scene, motion, solver, None, "")[1]
-        position = next(
-            (i for i, x in enumerate(scene.effects) if isinstance(x, BodyContact)),
-            len(scene.effects),
-        )
-        effects = (*scene.effects[:position], e, *scene.effects[position:])
-        if isinstance(e, Air):
-            # Damping approximates air drag, so Air replaces it.
-            effects = tuple(x for x in effects if not isinstance(x, Damping))
+        effects = _with_effect(scene.effects, e)
         row, rollout = _measure(
             dataclasses.replace(scene, effects=effects), motion, solver, whole, ""
         )
         name = type(e).__name__
+        seen = "" if row.rms_mm > base.jitter_mm else "No measurable effect. "
         reason = (
-            f"With it the cloth moves by {row.rms_mm:.1f} mm; it costs"
+            f"{seen}With it the cloth moves by {row.rms_mm:.1f} mm; it costs"
             f" {row.ms_per_frame - base.ms_per_frame:.1f} ms a frame."
         )
-        needed = row.rms_mm > 1e3 * tolerance
+        needed = row.rms_mm > max(1e3 * tolerance, base.jitter_mm)
         if isinstance(e, SelfContact):
             least = float(rollout.diagnostics["self_gap"].min())
             if least >= e.gap:
@@ -183,11 +207,20 @@ def recommend_effects(
                 if math.isfinite(least):
                     near = f"nearer to itself than {1e3 * least:.1f} mm"
                 reason = f"Cloth never comes {near}."
-        out.append(Advice(name, needed, reason))
+        out.append(Advice(name, needed, reason, e))
         advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
         if progress is not None:
             progress(k + 1, len(extra))
     return out
+
+
+def _noise_floor(scene: Scene, motion: Motion, solver: Solver, whole: Rollout) -> float:
+    """RMS distance of two runs that differ by 1e-6 m [mm]."""
+    noise = np.random.default_rng(0).normal(0.0, 1e-6, motion.root.shape)
+    moved = dataclasses.replace(motion, root=motion.root + jnp.asarray(noise, jnp.float32))
+    (again,) = simulate_batch(prepare_scene(scene), [moved], solver=solver)
+    gap = np.concatenate(again.positions, axis=1) - np.concatenate(whole.positions, axis=1)
+    return 1e3 * float(np.sqrt(np.mean(np.sum(gap * gap, axis=2))))
 
 
 def _measure(
@@ -217,6 +250,7 @@ def _measure(
             1e3 * float(np.median(laps[1:] if len(laps) > 1 else laps)) / ROLLOUT_BLOCK,
             flops / 1e6,
             float(laps[0]),
+            0.0,
         ),
         rollout,
     )
