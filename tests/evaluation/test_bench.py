@@ -42,7 +42,7 @@ def test_baseline_is_worst_and_more_substeps_reduce_the_error(rows):
     assert worst.solver == "nothing"
     errors = [by["xpbd", str(n)].rms_mm for n in (8, 32, 128)]
     assert errors == sorted(errors, reverse=True)
-    assert by["xpbd", JITTER].rms_mm < 0.1 * by["xpbd", "128"].rms_mm
+    assert by["xpbd", JITTER].rms_mm < 0.3 * by["xpbd", "128"].rms_mm
     assert all(r.ms_per_frame > 0 for r in rows if r.solver != "nothing")
     good = time_to_error(rows, 1.05 * errors[0])
     assert good is not None and good.rms_mm <= 1.05 * errors[0]

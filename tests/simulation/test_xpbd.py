@@ -289,3 +289,19 @@ def test_diagnostics_of_a_frame_refer_to_that_frame():
     np.testing.assert_allclose(out.diagnostics["speed_max"], 9.81 * fallen, rtol=1e-4)
     moved = np.diff(out.positions[0][:, 0, 1]) * 10.0
     np.testing.assert_allclose(-moved, 9.81 * (fallen[1:] - 0.05 + 3 / 22 / 20), rtol=1e-3)
+
+
+@pytest.mark.release
+def test_company_in_the_batch_changes_no_bit():
+    scene = prepare_scene(Scene((template("bottom"),)))
+
+    def first(name):
+        m = load_motion(name, fps=30.0)
+        return dataclasses.replace(m, rotations=m.rotations[:5], root=m.root[:5])
+
+    person, walker, dancer = (first(n) for n in ("punch", "walk", "spin"))
+    runs = [
+        simulate_batch(scene, [person, other], solver=XPBD(8, 1))[0].positions[0]
+        for other in (walker, dancer)
+    ]
+    np.testing.assert_array_equal(*runs)

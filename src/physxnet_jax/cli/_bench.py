@@ -67,4 +67,5 @@ def bench_simulator(command: Bench, console: Console) -> int:
 
 
 def _label(r: Work) -> str:
-    return r.solver if r.reference.startswith("verlet") else f"{r.solver} (against itself)"
+    external = r.reference.startswith(("blender", "newton"))
+    return f"{r.solver} (against itself)" if external else r.solver

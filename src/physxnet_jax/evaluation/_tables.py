@@ -172,6 +172,9 @@ _WORK_COLUMNS = (
     "inside",
     "pinched",
     "bad frames",
+    "visible skin",
+    "self-crossing",
+    "folds",
     "strain",
     "ms/frame",
     "against",
@@ -197,7 +200,7 @@ def work_tables(rows: Items[Work]) -> str:
 
 def _work_cells(r: Work) -> list[str]:
     if r.failed:
-        return [r.solver, r.setting, "failed", r.failed, *[""] * 5, r.reference]
+        return [r.solver, r.setting, "failed", r.failed, *[""] * 8, r.reference]
     return [
         r.solver,
         r.setting,
@@ -206,6 +209,9 @@ def _work_cells(r: Work) -> list[str]:
         f"{100 * r.penetration_share:.2f} %",
         f"{100 * r.pinched_share:.2f} %",
         str(r.penetrating_frames),
+        "" if math.isnan(r.visible_skin) else f"{100 * r.visible_skin:.3f} %",
+        "" if math.isnan(r.self_crossing) else f"{100 * r.self_crossing:.2f} %",
+        "" if math.isnan(r.folds) else f"{r.folds:.2f}",
         f"{r.strain_p99:.3f}",
         f"{r.ms_per_frame:.1f}",
         r.reference,
