@@ -82,12 +82,12 @@ def loss(log_factor):
 
 
 log_factor = jnp.float32(0.0)
-optimizer = optax.adam(optax.cosine_decay_schedule(0.15, 40))
+optimizer = optax.adam(optax.cosine_decay_schedule(0.2, 60))
 state = optimizer.init(log_factor)
-for k in range(40):
+for k in range(60):
     value, slope = loss(log_factor)
     change, state = optimizer.update(slope, state)
     log_factor = optax.apply_updates(log_factor, change)
-    if k % 8 == 0:
+    if k % 12 == 0:
         print(f"step {k:2d}: {float(value):9.4f} mm^2, {float(jnp.exp(log_factor)):.2f} times")
 print(f"found {float(jnp.exp(log_factor)):.2f} times the stiffness; hidden were 3.00")

@@ -47,7 +47,7 @@ def test_closest_skin_point_matches_brute_force(body, rest, name):
     )
     begin = jax.jit(lambda x, at: contact.begin(x, at, at, CLOCK, contact.init_state(1)))
     context = begin(x[:, :, None], placed)
-    mine = np.linalg.norm(np.asarray(context.where)[..., 0], axis=1)
+    mine = np.linalg.norm(np.asarray(context.surface.where)[: len(x), :, 0], axis=1)
     mesh = body.mesh(rest[:NUM_BODY_VERTICES])
     exact = np.sqrt(np.asarray(closest_points(mesh, x).squared_distance))
     assert (mine > exact - 1e-5).all(), "nothing is closer than the closest"
@@ -177,7 +177,7 @@ def test_pinched_cloth_lies_between_overlapping_limbs(body, rest):
 def test_contact_corrections_are_bounded_by_the_push_setting(push):
     """Trousers 12 mm in the skin, one substep."""
     g = template("bottom")
-    (contact,) = prepare_scene(Scene((g,), (BodyContact(push=push),))).effects
+    (contact,) = prepare_scene(Scene((g,), (BodyContact(push=push, sample_spacing=1.0),))).effects
     x = g.mesh.vertices - 0.012 * vertex_normals(g.mesh.vertices, g.mesh.faces)
     skin = PosedPoints(contact.skin.rest[:, :, None], contact.skin.normals[:, :, None])
     begun = contact.begin(
