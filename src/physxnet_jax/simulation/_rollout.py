@@ -70,8 +70,8 @@ PRESETS: dict[str, Solver] = {
 }
 """Solvers by accuracy, for 30 frames per second; `Solver.at_rate` converts to other rates.
 
-Four times the substeps of ``reference`` change the cloth no more than a jitter of 1e-6 m does;
-docs/simulation.md has the distance of each preset to it, and its time.
+docs/simulation.md has the distance of each preset to ``reference``, its time, and how much four
+times the substeps of ``reference`` change next to a jitter of 1e-6 m.
 """
 
 
