@@ -14,6 +14,7 @@ from physxnet_jax.geometry import (
     fast_argmin,
     make_mesh,
     nearby_faces,
+    nearest_index,
     signed_distance,
 )
 
@@ -110,6 +111,21 @@ def test_fast_argmin_matches_argmin():
     values[0] = np.inf
     np.testing.assert_array_equal(np.asarray(fast_argmin(jnp.asarray(values))), values.argmin(1))
     assert int(fast_argmin(jnp.full((1, 7), jnp.nan))[0]) == 6
+
+
+@pytest.mark.parametrize("rows", [1, 2, 16, 97, 880])
+def test_nearest_index_finds_the_smallest_value_up_to_its_precision(rows):
+    rng = np.random.default_rng(rows)
+    values = rng.uniform(0, 1, (rows, 50, 2)).astype(np.float32)
+    values[:, 0] = 0.0
+    found = np.asarray(nearest_index(jnp.asarray(values)))
+    assert found.shape == (50, 2) and found.max() < rows
+    taken = np.take_along_axis(values, found[None], axis=0)[0]
+    np.testing.assert_array_less(taken, values.min(axis=0) * (1 + 2 * rows / 2**23) + 1e-30)
+    clear = np.full((rows, 1), 2.0, np.float32)
+    clear[rows // 2] = 1.0
+    assert int(nearest_index(jnp.asarray(clear))[0]) == rows // 2
+    assert int(nearest_index(jnp.full((rows, 1), jnp.nan))[0]) < rows
 
 
 @pytest.mark.release

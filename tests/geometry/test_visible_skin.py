@@ -62,6 +62,14 @@ def test_the_side_that_faces_the_body_is_not_shown_by_skin():
     assert visible_skin(SKIN, FACES, [(0.985 * SKIN, FACES[:, ::-1])]).through == 0
 
 
+def test_cloth_beyond_a_thin_limb_is_not_behind_its_skin():
+    """A bare arm before a shirt: the outer side of cloth follows, but outside the arm."""
+    arm, beyond = 0.01 * SKIN, 0.008 * SKIN
+    behind = visible_skin(arm, FACES, [(beyond - [0.0, 0.0, 0.02], FACES)], cameras=1)
+    within = visible_skin(arm, FACES, [(beyond, FACES)], cameras=1)
+    assert behind.through == 0 and within.through > 1000
+
+
 def test_bad_numbers_are_refused():
     with pytest.raises(ValueError, match="at least 1 and 16"):
         visible_skin(SKIN, FACES, [], cameras=0)

@@ -86,5 +86,8 @@ def _covered_faces(
     cloth = make_mesh(assembly.rest, assembly.faces)
     # From a little below: cloth may rest on the skin or in it.
     hits = cast_rays(cloth, skin - 0.01 * normals, normals, max_distance=_COVER)
-    over: Bool[np.ndarray, "faces 3"] = np.asarray(hits.valid)[faces]
+    # Through its inner side: a bare arm faces the outer side of cloth on the trunk.
+    a, b, c = (assembly.rest[corner] for corner in assembly.faces[np.asarray(hits.face)].T)
+    leaves = np.einsum("ij,ij->i", np.cross(b - a, c - a), np.asarray(normals)) > 0
+    over: Bool[np.ndarray, "faces 3"] = (np.asarray(hits.valid) & leaves)[faces]
     return np.logical_or.reduce(over, axis=1)

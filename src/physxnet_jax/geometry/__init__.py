@@ -7,6 +7,7 @@ from ._closest import (
     closest_barycentric as closest_barycentric,
     closest_points as closest_points,
     fast_argmin as fast_argmin,
+    nearest_index as nearest_index,
     signed_distance as signed_distance,
 )
 from ._edge_constraints import (

@@ -193,6 +193,22 @@ def fast_argmin(values: Float[Array, "rows columns"], *, axis: int = 1) -> Int[A
     return jnp.min(jnp.where(values <= smallest, index, values.shape[axis] - 1), axis=axis)
 
 
+def nearest_index(squared: Float[Array, " rows *others"]) -> Int[Array, " *others"]:
+    """Index along the first axis of the smallest value, among values that are not negative.
+
+    Several times faster than `fast_argmin`: the index takes the place of the last bits of
+    the values, so that a minimum suffices. Values that differ by less than the number of
+    rows over 2^23 of their size count as equal; of those, any may be chosen.
+
+    Args:
+        squared: Values of at least 0, as squared distances.
+    """
+    mask = (1 << max(squared.shape[0] - 1, 1).bit_length()) - 1
+    bits = jax.lax.bitcast_convert_type(squared.astype(jnp.float32), jnp.int32)
+    index = jax.lax.broadcasted_iota(jnp.int32, squared.shape, 0)
+    return jnp.minimum(jnp.min((bits & ~mask) | index, axis=0) & mask, squared.shape[0] - 1)
+
+
 def signed_distance(
     mesh: TriMesh,
     points: Float[Array, "points 3"],

@@ -43,9 +43,10 @@ def visible_skin(
     """Looks at a dressed person from all around and counts skin that came through cloth.
 
     A pixel counts if skin is seen there and the outer side of cloth lies within ``reach`` behind
-    it. Skin seen through an opening or under a hem has no cloth that near behind it, or its
-    inner side. The cameras are orthographic, stand around the vertical, look down and up in turn
-    and fit the whole person; the result is deterministic.
+    it, inside the body. Skin seen through an opening or under a hem has no cloth that near
+    behind it, or its inner side; cloth beyond a bare arm lies outside the body. The cameras are
+    orthographic, stand around the vertical, look down and up in turn and fit the whole person;
+    the result is deterministic.
 
     Args:
         skin: Skin vertices [m], Y up.
@@ -74,8 +75,9 @@ def visible_skin(
         axes = _axes(2.0 * np.pi * k / cameras, np.radians(_ELEVATIONS[k % len(_ELEVATIONS)]))
         bare, body = _depths([(skin, skin_faces)], axes, centre, size, pixels, [counted])
         outside, inside = _depths(cloth, axes, centre, size, pixels, [None] * len(cloth))
+        leaving = _depths([(skin, skin_faces)], axes, centre, size, pixels, [None])[1]
         # Skin in front of all cloth, and the outer side of cloth the first thing behind it.
-        first = (outside <= inside) & np.isfinite(outside)
+        first = (outside <= np.minimum(inside, leaving)) & np.isfinite(outside)
         seen = (body < bare) & (body < outside)
         through += int(np.sum(first & seen & (outside < body + reach)))
         front = np.minimum(outside, inside)

@@ -52,11 +52,11 @@ class XPBD(Solver):
     def init_state(self, velocity: Array, h: float) -> Any:
         """What order 2 keeps of the last substep, and whether there was one.
 
-        Displacement, the velocity before it, and which vertices contact pushed.
+        Displacement, the velocity before it, and 1 for vertices that contact pushed, else 0.
         """
         if self.order == 1:
             return ()
-        return h * velocity, velocity, jnp.zeros(velocity[:, :1].shape, bool), jnp.zeros((), bool)
+        return h * velocity, velocity, jnp.zeros_like(velocity[:, :1]), jnp.zeros((), bool)
 
     def _implicit_step(self, h: float) -> float:
         return h * (1.0 - _BACK) if self.order == 2 else h
@@ -103,20 +103,23 @@ class XPBD(Solver):
             ahead = accelerate_all(system.effects, contexts, ahead, step)
             predicted = start + step * ahead
             progress = (i + 1).astype(d.dtype) * share
-            x, touched = predicted, jnp.zeros(d[:, :1].shape, bool)
+            x, touched = predicted, jnp.zeros_like(d[:, :1])
             for e, context in zip(system.effects, contexts, strict=True):
                 moved = e.project(x, d, context, progress, Step(step, share))
                 if e.unilateral:
-                    touched = touched | jnp.any(moved != x, axis=1, keepdims=True)
+                    size = jnp.sum(jnp.abs(moved - x), axis=1, keepdims=True)
+                    touched = jnp.maximum(touched, (size > 0).astype(d.dtype))
                 x = moved
             new_v = ahead + (x - predicted) / step
             if not before:
                 return x, new_v, ()
             # A push lasts for one substep, but the formula would spread it over the next ones
-            # too, and throw off what touches: there, one step of backward Euler.
-            begins = touched & ~before[2]
-            new_v = jnp.where(begins, (x - d) / h, new_v)
-            return x, new_v, (x - d, jnp.where(begins, new_v, v), touched)
+            # too, and throw off what touches: there, one step of backward Euler. By products,
+            # since selections of rows aren't vectorised on CPUs and take three times as long.
+            begins = touched * (1.0 - before[2])
+            move = x - d
+            new_v = new_v + begins * (move / h - new_v)
+            return x, new_v, (move, v + begins * (new_v - v), touched)
 
         zero = jnp.zeros_like(velocity)
         d, v, past = jax.lax.fori_loop(0, count, substep, (zero, velocity, past))

@@ -33,12 +33,12 @@ def test_moves_of_all_samples_by_one_vector_move_the_vertices_by_no_more():
     x = jnp.zeros((9, 3, 2))
     samples = sample_faces(np.asarray(g.mesh.vertices, np.float64), np.asarray(g.mesh.faces), 0.05)
     one = jnp.ones((samples.count, 3, 2)) * jnp.asarray([0.01, 0.02])[None, None]
-    acts = jnp.ones((samples.count, 1, 2), bool)
+    acts = jnp.ones((samples.count, 1, 2))
     free = jnp.ones((9, 1)).at[4].set(0.0)
     moved = np.asarray(samples.push(x, one, acts, free))
     assert (moved[4] == 0).all(), "held"
     assert moved.max() <= 0.02 * 1.5 and np.delete(moved[..., 0], 4, axis=0).min() >= 0.005
-    still = np.asarray(samples.push(x, one, ~acts, free))
+    still = np.asarray(samples.push(x, one, 0.0 * acts, free))
     assert (still == 0).all(), "samples that don't act move nothing"
 
 
@@ -48,7 +48,7 @@ def test_skin_does_not_show_through_large_triangles(data_dir):
     motion = load_motion("punch", fps=30.0)
     motion = dataclasses.replace(motion, rotations=motion.rotations[:20], root=motion.root[:20])
     shares = []
-    for spacing in (0.03, 10.0):
+    for spacing in (BodyContact().sample_spacing, 10.0):
         effects = tuple(
             BodyContact(sample_spacing=spacing) if isinstance(e, BodyContact) else e
             for e in STANDARD

@@ -10,15 +10,21 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
-from ...body import NUM_BODY_VERTICES, Body, triangulate
+from ...body import NUM_BODY_VERTICES, triangulate
 from ...errors import check_counts, check_numbers
-from ...geometry import closest_barycentric, fast_argmin, spread_points, vertex_normals
+from ...geometry import (
+    closest_barycentric,
+    mesh_edges,
+    nearest_index,
+    vertex_normals,
+)
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints, Step
-from ._limbs import LOWER_ARMS, TRUNK, UPPER_ARMS, limb_labels
 from ._pinch import ROOM, Pinch, prepare_pinch
-from ._samples import Samples, sample_faces
+from ._relief import relief
+from ._samples import Samples, sample_faces, with_samples
+from ._search_start import patch_centres, sleeve_labels, starting_vertices
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +44,8 @@ class BodyContact(Effect):
     doesn't track but compares a list of patches on all limbs within reach.
 
     Edges and faces of the cloth larger than ``sample_spacing`` are kept off the skin at sample
-    points as well, so that no skin comes through a large triangle.
+    points as well, so that no skin comes through a large triangle. Over features of the skin
+    smaller than a triangle the cloth keeps their height in addition to its thickness.
 
     Attributes:
         sample_spacing: Largest distance between points of the cloth that feel contact [m].
@@ -57,7 +64,7 @@ class BodyContact(Effect):
         move, Mueller et al., Position based dynamics (2007), section 3.4.
     """
 
-    sample_spacing: float = 0.03
+    sample_spacing: float = 0.035
     patch: int = 12
     ring: int = 16
     hops: int = 3
@@ -73,23 +80,24 @@ class BodyContact(Effect):
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Builds patches around skin vertices and the first skin vertex of each search."""
+        reach = _RELIEF_REACH * min(_edge_length(assembly), self.sample_spacing)
         samples = sample_faces(assembly.rest, assembly.faces, self.sample_spacing)
         free = np.asarray(inverse_mass) > 0
-        assembly = _with_samples(assembly, samples)
+        assembly = with_samples(assembly, samples)
         body = assembly.body
         skin = assembly.rest_body[:NUM_BODY_VERTICES]
         faces = np.asarray(triangulate(body.quads))
         weights = np.asarray(body.weights)[:NUM_BODY_VERTICES]
-        label = _limbs(weights, body)
+        label = sleeve_labels(weights, body)
         loose = np.flatnonzero(assembly.loose)
         tight = np.flatnonzero(~assembly.loose)
         # Skin out of reach of the cloth is left out and not even posed.
-        reach = KDTree(assembly.rest).query(skin, distance_upper_bound=_REACH)[0]
-        used = np.flatnonzero(np.isfinite(reach))
+        distance = KDTree(assembly.rest).query(skin, distance_upper_bound=_REACH)[0]
+        used = np.flatnonzero(np.isfinite(distance))
         if len(used) < 3 * self.patch:
             used = np.arange(len(skin))
-        start = _starting_vertices(assembly, skin, used, label, tight)
-        listed = _patch_centres(assembly, skin, used, loose, self.spacing, self.centres)
+        start = starting_vertices(assembly, skin, used, label, tight)
+        listed = patch_centres(assembly, skin, used, loose, self.spacing, self.centres)
         kept = np.flatnonzero(np.isin(faces, used).all(axis=1))
         size = min(self.patch, len(kept))
         far, near = KDTree(skin[faces[kept]].mean(axis=1)).query(skin[used], k=size)
@@ -104,6 +112,7 @@ class BodyContact(Effect):
         return _Contact(
             samples,
             skinned_points,
+            float32(relief(skin, np.asarray(normals), reach)[used, None]),
             jnp.asarray(ring.reshape(len(used), -1).T.astype(np.int32)),
             jnp.asarray(near.T.astype(np.int32)),
             jnp.asarray(np.moveaxis(local[faces[kept]][near], 0, 2)),
@@ -133,70 +142,15 @@ _COVER = 0.002
 _NEAR = 0.001
 # Skin farther than this from all cloth at rest is left out [m].
 _REACH = 0.30
+# Distance from a triangle's middle to its corners, over the length of its edges.
+_RELIEF_REACH = 0.6
 
 
-def _with_samples(assembly: Assembly, samples: Samples) -> Assembly:
-    """The vertices with the samples after them, for everything that contact needs of them."""
-    corners, weights = np.asarray(samples.corners), np.asarray(samples.weights)
-
-    def more(x: np.ndarray) -> np.ndarray:
-        there = np.einsum("ks,ks...->s...", weights, x[corners])
-        return np.concatenate([x, there.astype(x.dtype)])
-
-    def some(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([x, x[corners].any(axis=0)])
-
-    return dataclasses.replace(
-        assembly,
-        rest=more(assembly.rest),
-        mass=more(assembly.mass),
-        pinned=some(assembly.pinned),
-        weights=more(assembly.weights),
-        thickness=more(assembly.thickness),
-        friction=more(assembly.friction),
-        loose=some(assembly.loose),
-    )
-
-
-def _starting_vertices(
-    assembly: Assembly,
-    skin: Float[np.ndarray, "body 3"],
-    used: Int[np.ndarray, " used"],
-    label: Int[np.ndarray, " body"],
-    rows: Int[np.ndarray, " tight"],
-) -> Int[np.ndarray, " tight"]:
-    """The nearest skin vertex of the same limb for each cloth vertex at rest."""
-    cloth = _limbs(assembly.weights, assembly.body)[rows]
-    out = np.zeros(len(rows), dtype=np.int64)
-    for lab in np.unique(cloth):
-        selected = cloth == lab
-        # Cloth of a limb starts on that limb or the trunk, cloth of the trunk anywhere.
-        pool = used if lab == TRUNK else used[(label[used] == lab) | (label[used] == TRUNK)]
-        pool = pool if len(pool) else used
-        out[selected] = pool[KDTree(skin[pool]).query(assembly.rest[rows[selected]])[1]]
-    return out
-
-
-def _patch_centres(
-    assembly: Assembly,
-    skin: Float[np.ndarray, "body 3"],
-    used: Int[np.ndarray, " used"],
-    rows: Int[np.ndarray, " loose"],
-    spacing: float,
-    count: int,
-) -> Int[np.ndarray, "loose k"]:
-    """Skin vertices whose patches each loose vertex compares."""
-    pool = used[spread_points(skin[used], spacing)]
-    k = min(count, len(pool))
-    return pool[KDTree(skin[pool]).query(assembly.rest[rows], k=k)[1].reshape(len(rows), k)]
-
-
-def _limbs(weights: Float[np.ndarray, "points joints"], body: Body) -> Int[np.ndarray, " points"]:
-    """Limb labels, between which tight garments don't slide; each arm is one limb."""
-    label = limb_labels(weights, body)
-    for upper, lower in zip(UPPER_ARMS, LOWER_ARMS, strict=True):
-        label[label == lower] = upper
-    return label
+def _edge_length(assembly: Assembly) -> float:
+    """Length of long edges at rest [m]."""
+    ends = mesh_edges(assembly.faces).vertices
+    length = np.linalg.norm(assembly.rest[ends[:, 0]] - assembly.rest[ends[:, 1]], axis=1)
+    return float(np.quantile(length, 0.9))
 
 
 @pytree
@@ -238,17 +192,21 @@ class _Touch:
     """Contacts of all cloth vertices and samples with the skin in a contact interval.
 
     Attributes:
-        surface: The skin beside them.
+        surface: The skin beside the vertices.
+        beside: The skin beside the samples.
         centre: Skin vertices at which the next search starts.
         room: Gap at each skin vertex at the end, see `Pinch.room`.
+        margin: Gap kept to the skin where nothing else is in the way [m].
         missed: Whether the closest point may lie beyond the patch.
         unit: Unit normal at the start.
         ceiling: Maximum outward speed of touching cloth [m/s].
     """
 
     surface: _Surface
+    beside: _Surface
     centre: Int[Array, "tight batch"]
     room: Float[Array, "skin batch"]
+    margin: Float[Array, "points 1 batch"]
     missed: Bool[Array, "points batch"]
     unit: Float[Array, "points 3 batch"]
     ceiling: Float[Array, "points 1 batch"]
@@ -260,6 +218,7 @@ class _Contact(Prepared):
     unilateral = True
     samples: Samples
     skin: SkinnedPoints
+    relief: Float[Array, "skin 1"]
     ring: Int[Array, "ring skin"]
     table: Int[Array, "patch skin"]
     corners: Int[Array, "patch 3 skin"]
@@ -303,12 +262,18 @@ class _Contact(Prepared):
         skin: Float[Array, "skin 3 batch"],
         at: Int[Array, "some batch"],
     ) -> Int[Array, "some batch"]:
-        """Moves ``hops`` times to the nearest skin vertex of the current vertex's ring."""
+        """Moves up to ``hops`` times to the nearest skin vertex of the current vertex's ring."""
 
-        def hop(_: Array, at: Array) -> Array:
-            return _pick(points, skin, self.ring[:, at])
+        def hop(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            at, _, count = carry
+            to = _pick(points, skin, self.ring[:, at])
+            return to, jnp.any(to != at), count + 1
 
-        return jax.lax.fori_loop(0, self.hops, hop, at)
+        def goes_on(carry: tuple[Array, Array, Array]) -> Array:
+            return carry[1] & (carry[2] < self.hops)
+
+        start = at, jnp.ones((), bool), jnp.zeros((), jnp.int32)
+        return jax.lax.while_loop(goes_on, hop, start)[0]
 
     def closest(
         self,
@@ -317,20 +282,16 @@ class _Contact(Prepared):
         centre: Int[Array, "some batch"],
     ) -> tuple[Array, Array]:
         """Face and barycentric weights [3, some, batch] of the closest point on a patch."""
-        batch = points.shape[2]
-        # [patch, 3, some, batch], flattened so that each gather reads scalars.
-        corner = (
-            self.corners[:, :, centre] * batch
-            + jnp.arange(batch, dtype=jnp.int32)[None, None, None]
-        )
-        flat = [skin[:, i].reshape(-1) for i in range(3)]
-        tri = [jnp.stack([f[corner[:, k]] for f in flat]) for k in range(3)]
-        p = jnp.broadcast_to(jnp.moveaxis(points, 1, 0)[:, None], tri[0].shape)
-        weights, squared = closest_barycentric(p, *tri)
-        best = jnp.argmin(squared, axis=0)
-        face = jnp.take_along_axis(self.table[:, centre], best[None], axis=0)[0]
-        weights = jnp.take_along_axis(weights, best[None, None], axis=1)[:, 0]
-        return jax.lax.stop_gradient(face), weights
+        stop = jax.lax.stop_gradient
+        p = jnp.moveaxis(points, 1, 0)
+        # Arithmetic that is fused with gathers or with the search isn't vectorised.
+        apart = jax.lax.optimization_barrier
+        tri = apart(_corners(stop(skin), self.corners[:, :, centre], axis=1))
+        _, squared = closest_barycentric(jnp.broadcast_to(stop(p)[:, None], tri[0].shape), *tri)
+        best = nearest_index(apart(squared))[None]
+        face = jnp.take_along_axis(self.table[:, centre], best, axis=0)[0]
+        weights, _ = closest_barycentric(p, *_corners(skin, self.faces[face], axis=-1))
+        return face, weights
 
     def begin(
         self,
@@ -360,31 +321,39 @@ class _Contact(Prepared):
         far = jnp.sum(from_centre**2, axis=1) > self.radius[last] ** 2
         unit = n0 / jnp.sqrt(jnp.sum(n0 * n0, axis=1, keepdims=True) + 1e-12)
         later = self.pinch.room(end)
-        wanted, top = self._height_bounds(room, face, weights)
-        rise, fall = self._height_bounds(later, face, weights)
+        margin = self.thickness[..., None] + self._at(self.relief, face, weights)
+        wanted, top = self._height_bounds(self._at(room, face, weights), margin)
+        rise, fall = self._height_bounds(self._at(later, face, weights), margin)
         height = jnp.sum((base - p0) * unit, axis=1, keepdims=True)
         touching = height < wanted + _NEAR
         fastest = jnp.sum((p1 - p0) * unit, axis=1, keepdims=True) / clock.length + self.leave
         ceiling = jnp.where(touching, fastest, jnp.inf)
         heights = wanted, rise - wanted, top, fall - top
         surface = _Surface(p0 - base, p1 - p0, n0, n1 - n0, *heights)
-        return _Touch(surface, centre, later, far, unit, ceiling)
+        vertices = len(base) - self.samples.count
+        # Apart already here: XLA would cut them in each substep.
+        own, beside = (
+            jax.lax.optimization_barrier(jax.tree.map(lambda x, rows=rows: x[rows], surface))
+            for rows in (slice(vertices), slice(vertices, None))
+        )
+        return _Touch(own, beside, centre, later, margin, far, unit, ceiling)
 
-    def _height_bounds(self, room: Array, face: Array, weights: Array) -> tuple[Array, Array]:
-        """Minimum and maximum height above the skin [m], equal where limbs leave no gap."""
-        lane = jnp.arange(room.shape[1])[None]
+    def _at(self, values: Array, face: Array, weights: Array) -> Float[Array, "points 1 batch"]:
+        """Values of skin vertices at points of faces."""
+        lane = jnp.arange(values.shape[1])[None]
         tri = self.faces[face]
-        there = jnp.sum(
-            jnp.stack([weights[k] * room[tri[..., k], lane] for k in range(3)]), axis=0
-        )[:, None]
+        parts = [weights[k] * values[tri[..., k], lane] for k in range(3)]
+        return jnp.sum(jnp.stack(parts), axis=0)[:, None]
+
+    def _height_bounds(self, room: Array, margin: Array) -> tuple[Array, Array]:
+        """Minimum and maximum height above the skin [m], equal where limbs leave no gap."""
         # Grows smoothly to `_FREE` as the gap approaches `ROOM`, beyond which there is no pinch.
-        there = there / jnp.maximum(1.0 - (jnp.maximum(there, 0.0) / ROOM) ** 2, ROOM / _FREE)
+        there = room / jnp.maximum(1.0 - (jnp.maximum(room, 0.0) / ROOM) ** 2, ROOM / _FREE)
         there = jnp.where(self.hanging[..., None], _FREE, there)
-        thickness = self.thickness[..., None]
         # Layers keep their order on both limbs: the outermost lies in the middle.
         outermost = self.thickness.max()
-        under = outermost - thickness
-        low = jnp.minimum(thickness, 0.5 * there + _COVER - under)
+        under = outermost - self.thickness[..., None]
+        low = jnp.minimum(margin, 0.5 * there + _COVER - under)
         return low, jnp.maximum(there - outermost - under, low)
 
     def accelerate(self, velocity: Array, context: _Touch, h: float) -> Array:
@@ -400,50 +369,54 @@ class _Contact(Prepared):
         progress: Array,
         step: Step,
     ) -> Array:
-        vertices = len(displacement)
-        own = jax.tree.map(lambda x: x[:vertices], context.surface)
-        moved, _ = self._pushed(displacement, start, own, progress, step, slice(vertices))
+        vertices = slice(len(displacement))
+        moved, _ = self._pushed(displacement, start, context.surface, progress, step, vertices)
         moved = displacement + (moved - displacement) * self.free[..., None]
         if self.samples.count:
-            rest = jax.tree.map(lambda x: x[vertices:], context.surface)
-            at = self.samples.points(moved)
-            pushed, lift = self._pushed(
-                at, self.samples.points(start), rest, progress, step, slice(vertices, None)
-            )
-            moved = self.samples.push(moved, pushed - at, lift != 0, self.free)
+            # Barriers: XLA would compute and gather anew for each use.
+            apart = jax.lax.optimization_barrier
+            moved = apart(moved)
+            at, before = apart((self.samples.points(moved), self.samples.points(start)))
+            rest = slice(len(displacement), None)
+            pushed, lift = self._pushed(at, before, context.beside, progress, step, rest)
+            move, acts = apart((pushed - at, (lift != 0).astype(at.dtype)))
+            moved = self.samples.push(moved, move, acts, self.free)
         return moved
 
     def _pushed(
         self,
         displacement: Array,
         start: Array,
-        context: "_Surface",
+        surface: _Surface,
         progress: Array,
         step: Step,
         points: slice,
     ) -> tuple[Array, Array]:
         """Displacements of points after contact and friction, and how far they were lifted [m]."""
-        n, height = context.height_of(displacement, progress)
-        low = context.height + progress * context.rise
-        high = context.top + progress * context.fall
+        n, height = surface.height_of(displacement, progress)
+        low = surface.height + progress * surface.rise
+        high = surface.top + progress * surface.fall
         slowest = -self.leave * step.length
         lift = jnp.clip(jnp.clip(height, low, high) - height, slowest, self.push)
         # Without a maximum height, cloth above the skin is free.
         lift = jnp.where(high > 0.9 * _FREE, jnp.maximum(lift, 0.0), lift)
         moved = displacement + lift * n
         # Friction opposes the motion relative to the skin in this substep.
-        slide = (moved - start) - step.share * context.way
+        slide = (moved - start) - step.share * surface.way
         slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
         length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
         hold = jnp.minimum(1.0, self.friction[points][..., None] * jnp.abs(lift) / length)
         return moved - hold * slide, lift
 
     def diagnose(self, displacement: Array, context: _Touch) -> dict[str, Array]:
+        surface = jax.tree.map(
+            lambda x, y: jnp.concatenate([x, y]), context.surface, context.beside
+        )
         points = self.samples.extend(displacement)
-        height = context.surface.height_of(points, jnp.ones((), displacement.dtype))[1]
+        height = surface.height_of(points, jnp.ones((), displacement.dtype))[1]
         # Depth below the skin or, in a pinch, below a thickness under its middle.
-        wanted = context.surface.height + context.surface.rise
-        inside = (wanted - self.thickness[..., None] - height)[:, 0]
+        wanted = surface.height + surface.rise
+        inside = (wanted - context.margin - height)[:, 0]
         return {
             "penetration_max": jnp.maximum(inside.max(axis=0), 0.0),
             "inside_share": jnp.mean((inside > 0).astype(displacement.dtype), axis=0),
@@ -459,12 +432,27 @@ def _pick(
     candidates: Int[Array, "candidates some batch"],
 ) -> Int[Array, "some batch"]:
     """The nearest of each point's candidates among the skin vertices."""
-    batch = points.shape[2]
-    flat = candidates * batch + jnp.arange(batch, dtype=jnp.int32)[None, None]
-    gaps = [skin[:, i].reshape(-1)[flat] - points[None, :, i] for i in range(3)]
-    gap = gaps[0] ** 2 + gaps[1] ** 2 + gaps[2] ** 2
-    best = fast_argmin(gap.reshape(len(gap), -1), axis=0).reshape(1, *gap.shape[1:])
-    return jnp.take_along_axis(candidates, best, axis=0)[0]
+    there = _gather(skin, candidates)
+    x, y, z = (there[i] - points[None, :, i] for i in range(3))
+    gap = x * x + y * y + z * z
+    return jnp.take_along_axis(candidates, nearest_index(gap)[None], axis=0)[0]
+
+
+def _corners(
+    skin: Float[Array, "skin 3 batch"], index: Int[Array, "..."], axis: int
+) -> list[Float[Array, "3 ..."]]:
+    """The three corners of triangles, which the axis of ``index`` lists."""
+    index = jnp.moveaxis(index, axis, 0)
+    return [jnp.stack(_gather(skin, index[k])) for k in range(3)]
+
+
+def _gather(
+    skin: Float[Array, "skin 3 batch"], index: Int[Array, "*some batch"]
+) -> list[Float[Array, "*some batch"]]:
+    """Coordinates of skin vertices, gathered as scalars."""
+    lane = jax.lax.broadcasted_iota(index.dtype, index.shape, index.ndim - 1)
+    flat = index * skin.shape[2] + lane
+    return [skin[:, i].reshape(-1)[flat] for i in range(3)]
 
 
 def _surface(skin: PosedPoints, faces: Array, face: Array, weights: Array) -> tuple[Array, Array]:

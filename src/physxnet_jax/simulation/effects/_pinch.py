@@ -2,13 +2,14 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ...body import HANDS, Body, body_segments
-from ...geometry import fast_argmin, spread_points
+from ...geometry import nearest_index, spread_points
 from ...typing import pytree
 from .._assembly import float32
 from .._effect import PosedPoints
@@ -34,13 +35,15 @@ class Pinch:
 
     Attributes:
         samples: Skin vertices of the samples.
-        facing: Pairs of samples that can face each other.
+        facing: For each sample in a column, the samples that it can face.
+        paired: Samples that are in such a pair.
         near: Samples around each skin vertex, from which its gap is interpolated.
         weights: Interpolation weights.
     """
 
     samples: Int[Array, " samples"]
     facing: Bool[Array, "samples samples"]
+    paired: Bool[Array, "samples 1"]
     near: Int[Array, "3 skin"]
     weights: Float[Array, "3 skin 1"]
 
@@ -52,20 +55,15 @@ class Pinch:
         p, n = skin.points[self.samples], skin.normals[self.samples]
         gaps = [p[None, :, i] - p[:, None, i] for i in range(3)]
         gap = gaps[0] ** 2 + gaps[1] ** 2 + gaps[2] ** 2
-        gap = jnp.where(self.facing.T[..., None], gap, jnp.inf)
-        closest = fast_argmin(gap.reshape(len(gap), -1), axis=0).reshape(gap.shape[1:])
+        gap = jnp.where(self.facing[..., None], gap, jnp.inf)
+        closest = nearest_index(jax.lax.stop_gradient(gap))
         lane = jnp.arange(p.shape[2])[None]
         away = p - jnp.moveaxis(p[closest, :, lane], -1, 1)
         normal = jnp.moveaxis(n[closest, :, lane], -1, 1)
         height = jnp.sum(away * normal, axis=1)
         beside = jnp.sum(away * away, axis=1) - height**2
         opposed = jnp.sum(n * normal, axis=1) < 0
-        valid = (
-            (height > -_MAX_DEPTH)
-            & (beside < _SPACING**2)
-            & opposed
-            & jnp.any(self.facing, axis=1)[:, None]
-        )
+        valid = (height > -_MAX_DEPTH) & (beside < _SPACING**2) & opposed & self.paired
         room = jnp.where(valid, jnp.minimum(height, ROOM), ROOM)
         return jnp.sum(self.weights * room[self.near], axis=0)
 
@@ -96,7 +94,9 @@ def prepare_pinch(
     w = w / w.sum(axis=1, keepdims=True)
     return Pinch(
         jnp.asarray(pool.astype(np.int32)),
-        jnp.asarray(facing),
+        # Transposed: the search looks for the other sample along the first axis.
+        jnp.asarray(facing.T),
+        jnp.asarray(facing.any(axis=1, keepdims=True)),
         jnp.asarray(near.T.astype(np.int32)),
         float32(w.T[..., None]),
     )

@@ -3,13 +3,14 @@
 import dataclasses
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from ...geometry import mesh_edges
 from ...typing import pytree
-from .._assembly import float32
+from .._assembly import Assembly, float32
 
 
 @pytree
@@ -20,17 +21,14 @@ class Samples:
     Attributes:
         corners: Corners of each sample; those of an edge repeat the last.
         weights: Their barycentric weights.
-        owners: Vertices that are a corner of a sample.
-        near: Samples of each owner, with the number of samples for padding.
-        share: Weight of the owner in each of them over the sum of the sample's squared weights;
-            0 for padding.
+        shares: The weights over the sum of the sample's squared weights.
+        counts: 1 for each corner, 0 for a repeated one.
     """
 
     corners: Int[Array, "3 samples"]
     weights: Float[Array, "3 samples"]
-    owners: Int[Array, " owners"]
-    near: Int[Array, "most owners"]
-    share: Float[Array, "most owners"]
+    shares: Float[Array, "3 samples"]
+    counts: Float[Array, "3 samples"]
 
     @property
     def count(self) -> int:
@@ -52,7 +50,7 @@ class Samples:
         self,
         x: Float[Array, "vertices 3 batch"],
         move: Float[Array, "samples 3 batch"],
-        acts: Bool[Array, "samples 1 batch"],
+        acts: Float[Array, "samples 1 batch"],
         free: Float[Array, "vertices 1"],
     ) -> Float[Array, "vertices 3 batch"]:
         """Moves vertices so that the samples move; each takes the mean over those that act.
@@ -60,16 +58,16 @@ class Samples:
         Args:
             x: Displacements [m].
             move: Moves of the samples [m].
-            acts: Samples that act.
+            acts: 1 for samples that act, else 0.
             free: 1 for vertices that can move, 0 for held ones.
         """
-        padding = ((0, 1), (0, 0), (0, 0))
-        move = jnp.pad(jnp.where(acts, move, 0.0), padding)
-        number = jnp.pad(acts.astype(move.dtype), padding)
-        total = jnp.sum(self.share[..., None, None] * move[self.near], axis=0)
-        mean = total / jnp.maximum(jnp.sum(number[self.near], axis=0), 1.0)
-        mean = mean * free[self.owners][..., None]
-        return x.at[self.owners].add(mean, unique_indices=True)
+        rows = jax.lax.optimization_barrier(jnp.concatenate([acts * move, acts], axis=1))
+        total = jnp.zeros((len(x), *rows.shape[1:]), x.dtype)
+        for corner, share, counts in zip(self.corners, self.shares, self.counts, strict=True):
+            weight = jnp.stack([share, share, share, counts], axis=1)[..., None]
+            total = total.at[corner].add(weight * rows)
+        mean = total[:, :3] / jnp.maximum(total[:, 3:], 1.0)
+        return x + mean * free[..., None]
 
 
 def sample_faces(
@@ -99,22 +97,32 @@ def sample_faces(
                 weights.append(((n - i - j) / n, i / n, j / n))
     at = np.asarray(corners, np.int64).reshape(-1, 3)
     w = np.asarray(weights, np.float64).reshape(-1, 3)
-    # A sample that repeats a corner counts once for it.
-    used = w > 0
-    vertex, sample = at[used], np.nonzero(used)[0]
-    share = (w / np.maximum((w * w).sum(axis=1, keepdims=True), 1e-12))[used]
-    order = np.argsort(vertex, kind="stable")
-    owners, first, number = np.unique(vertex[order], return_index=True, return_counts=True)
-    most = int(number.max(initial=0))
-    near = np.full((most, len(owners)), len(at), np.int64)
-    shares = np.zeros((most, len(owners)))
-    rank = np.arange(len(order)) - np.repeat(first, number)
-    column = np.repeat(np.arange(len(owners)), number)
-    near[rank, column], shares[rank, column] = sample[order], share[order]
     return Samples(
         jnp.asarray(at.T.astype(np.int32)),
         float32(w.T),
-        jnp.asarray(owners.astype(np.int32)),
-        jnp.asarray(near.astype(np.int32)),
-        float32(shares),
+        float32((w / np.maximum((w * w).sum(axis=1, keepdims=True), 1e-12)).T),
+        float32((w > 0).T),
+    )
+
+
+def with_samples(assembly: Assembly, samples: Samples) -> Assembly:
+    """The vertices with the samples after them, for everything that contact needs of them."""
+    corners, weights = np.asarray(samples.corners), np.asarray(samples.weights)
+
+    def more(x: np.ndarray) -> np.ndarray:
+        there = np.einsum("ks,ks...->s...", weights, x[corners])
+        return np.concatenate([x, there.astype(x.dtype)])
+
+    def some(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([x, x[corners].any(axis=0)])
+
+    return dataclasses.replace(
+        assembly,
+        rest=more(assembly.rest),
+        mass=more(assembly.mass),
+        pinned=some(assembly.pinned),
+        weights=more(assembly.weights),
+        thickness=more(assembly.thickness),
+        friction=more(assembly.friction),
+        loose=some(assembly.loose),
     )
