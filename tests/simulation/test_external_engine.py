@@ -116,6 +116,12 @@ def test_peer_engines_are_evaluated_from_positions_only():
         "limbs_at_eight_times_their_speed",
         "a_teleport_of_two_metres",
         "closed_armpits_and_crossed_arms",
+        "edges_of_ten_centimetres",
+        "fifty_thousand_vertices",
+        "a_lined_top",
+        "a_cape_on_a_body_that_touches_itself",
+        "sleeves_on_crossed_arms",
+        "a_top_over_trousers",
     }
 
 

@@ -1,5 +1,6 @@
 """Accuracy metrics, robustness reports and cost tables of dressing methods."""
 
+from . import _stress_clothes as _stress_clothes  # its cases join `CASES`
 from ._baselines import (
     nearest_frame as nearest_frame,
     pose_features as pose_features,

@@ -1,6 +1,7 @@
 """What one sees at a glance: skin through cloth, and cloth through itself."""
 
 import dataclasses
+import itertools
 
 import jax.numpy as jnp
 import numpy as np
@@ -29,10 +30,13 @@ class SurfaceFaults:
         visible_skin: Share of pixels that show skin which came through the cloth over it, see
             `physxnet_jax.geometry.visible_skin`.
         self_crossing: Share of faces that cross other faces of the same garment.
+        visible_inner: Share of pixels that show an inner garment which came through one worn
+            over it; 0 for one garment.
     """
 
     visible_skin: float
     self_crossing: float
+    visible_inner: float = 0.0
 
 
 def surface_faults(
@@ -62,32 +66,47 @@ def surface_faults(
     )
     weights = jnp.asarray(body.weights[:NUM_BODY_VERTICES])
     skin = np.asarray(animate(body, rest, rest[:NUM_BODY_VERTICES], weights, part))
-    counted = _covered_faces(assembly, faces)
+    counted = _covered_faces(
+        assembly.rest_body[:NUM_BODY_VERTICES], faces, assembly.rest, assembly.faces
+    )
     bounds = list(zip(assembly.parts, assembly.parts[1:]))
     owner = np.searchsorted(assembly.parts, assembly.faces[:, 0], side="right") - 1
     garments = [assembly.faces[owner == k] - i for k, (i, _) in enumerate(bounds)]
-    through = covered = crossing = 0
+    rest_of = [assembly.rest[i:j] for i, j in bounds]
+    layers = [
+        (k, above, _covered_faces(rest_of[k], garments[k], rest_of[above], garments[above]))
+        for k, above in itertools.combinations(range(len(garments)), 2)
+    ]
+    through = covered = crossing = inner = outer = 0
     for s, x in zip(skin, positions[looked], strict=True):
         cloth = [(x[i:j], f) for (i, j), f in zip(bounds, garments, strict=True)]
         seen = visible_skin(s, faces, cloth, counted=counted)
         through, covered = through + seen.through, covered + seen.covered
         crossing += sum(len(np.unique(self_intersections(*mesh)[:, 1])) for mesh in cloth)
+        for k, above, under in layers:
+            seen = visible_skin(*cloth[k], [cloth[above]], counted=under)
+            inner, outer = inner + seen.through, outer + seen.covered
     return SurfaceFaults(
-        through / max(through + covered, 1), crossing / max(len(looked) * len(owner), 1)
+        through / max(through + covered, 1),
+        crossing / max(len(looked) * len(owner), 1),
+        inner / max(inner + outer, 1),
     )
 
 
 def _covered_faces(
-    assembly: Assembly, faces: Int[np.ndarray, "faces 3"]
+    inner: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    outer: Float[np.ndarray, "cloth 3"],
+    outer_faces: Int[np.ndarray, "triangles 3"],
 ) -> Bool[np.ndarray, " faces"]:
-    """Triangles of the skin with cloth over them at rest."""
-    skin = jnp.asarray(assembly.rest_body[:NUM_BODY_VERTICES], jnp.float32)
-    normals = vertex_normals(skin, jnp.asarray(faces))
-    cloth = make_mesh(assembly.rest, assembly.faces)
+    """Triangles of skin, or of a garment, with cloth over them at rest."""
+    x = jnp.asarray(inner, jnp.float32)
+    normals = vertex_normals(x, jnp.asarray(faces))
     # From a little below: cloth may rest on the skin or in it.
-    hits = cast_rays(cloth, skin - 0.01 * normals, normals, max_distance=_COVER)
+    start = x - 0.01 * normals
+    hits = cast_rays(make_mesh(outer, outer_faces), start, normals, max_distance=_COVER)
     # Through its inner side: a bare arm faces the outer side of cloth on the trunk.
-    a, b, c = (assembly.rest[corner] for corner in assembly.faces[np.asarray(hits.face)].T)
+    a, b, c = (outer[corner] for corner in outer_faces[np.asarray(hits.face)].T)
     leaves = np.einsum("ij,ij->i", np.cross(b - a, c - a), np.asarray(normals)) > 0
     over: Bool[np.ndarray, "faces 3"] = (np.asarray(hits.valid) & leaves)[faces]
     return np.logical_or.reduce(over, axis=1)

@@ -4,16 +4,71 @@ import numpy as np
 import pytest
 
 from physxnet_jax.evaluation import CASES, Finding, run_case
+from physxnet_jax.evaluation._stress_worn import run_own
 from physxnet_jax.garment import Fabric, square_sheet
-from physxnet_jax.simulation import Scene, Verlet, prepare_scene, settle_on_static_body
-from physxnet_jax.simulation.effects import Stretch
+from physxnet_jax.simulation import (
+    STANDARD,
+    Effect,
+    Scene,
+    Verlet,
+    prepare_scene,
+    settle_on_static_body,
+    standard_effects,
+)
+from physxnet_jax.simulation.effects import BodyContact, LayerContact, Stretch
+
+release = pytest.mark.release
 
 
-@pytest.mark.release
-@pytest.mark.parametrize("name", CASES)
+# A minute and a half, and 4 GB.
+_LARGE = "fifty_thousand_vertices"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.nightly if name == _LARGE else pytest.mark.release)
+        for name in CASES
+    ],
+)
 def test_hard_case_findings_hold(name):
     for finding in run_case(name):
         assert finding.holds, finding
+
+
+def without(kind: type[Effect], garments: int = 1) -> tuple[Effect, ...]:
+    return tuple(e for e in standard_effects(garments) if not isinstance(e, kind))
+
+
+def vertices_only() -> tuple[Effect, ...]:
+    coarse = BodyContact(sample_spacing=10.0)
+    return tuple(coarse if isinstance(e, BodyContact) else e for e in STANDARD)
+
+
+@pytest.mark.parametrize(
+    ("name", "effects", "quantity"),
+    [
+        pytest.param("edges_of_ten_centimetres", vertices_only(), "visible skin", marks=release),
+        pytest.param(_LARGE, without(BodyContact), "skinned cloth", marks=pytest.mark.nightly),
+        pytest.param("a_lined_top", without(BodyContact), "skinned cloth", marks=release),
+        pytest.param(
+            "a_cape_on_a_body_that_touches_itself",
+            without(BodyContact),
+            "vertices inside",
+            marks=release,
+        ),
+        pytest.param(
+            "sleeves_on_crossed_arms", without(BodyContact), "skinned cloth", marks=release
+        ),
+        pytest.param(
+            "a_top_over_trousers", without(LayerContact, 2), "visible inner", marks=release
+        ),
+    ],
+)
+def test_hard_clothes_break_their_bound_without_the_guard(name, effects, quantity):
+    _, rows = run_own(name, effects)
+    broken = [what for what, bound, measured in rows if not measured <= bound]
+    assert any(quantity in what for what in broken), broken
 
 
 def test_findings_fail_above_the_bound_and_for_nan():

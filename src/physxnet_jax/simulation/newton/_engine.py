@@ -30,6 +30,7 @@ class NewtonSettings:
         contact: Stiffness of contact [N/m].
         friction: Coulomb coefficient [1].
         self_collision: Whether cloth collides with itself.
+        contacts: Capacity of the contact buffer, in contacts per vertex; more are dropped.
     """
 
     substeps: int = 10
@@ -42,9 +43,10 @@ class NewtonSettings:
     contact: float = 1e4
     friction: float = 0.3
     self_collision: bool = False
+    contacts: int = 8
 
     def __post_init__(self) -> None:
-        check_counts(self, "substeps", "iterations")
+        check_counts(self, "substeps", "iterations", "contacts")
         check_numbers(self, "density", "stretch", "radius", "contact")
         check_numbers(self, "bend", "damping", "friction", zero=True)
 

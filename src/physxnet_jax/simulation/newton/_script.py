@@ -54,7 +54,9 @@ def main():
         iterations=settings["iterations"],
         particle_enable_self_contact=settings["self_collision"],
     )
-    pipeline = newton.CollisionPipeline(model, soft_contact_gap=0.03)
+    pipeline = newton.CollisionPipeline(
+        model, soft_contact_gap=0.03, soft_contact_max=settings["contacts"] * cloth.shape[1]
+    )
     contacts = pipeline.contacts()
     mesh = body.mesh
     first, second, control = model.state(), model.state(), model.control()
