@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from physxnet_jax.dressing import Inference, dress, infer_block
+from physxnet_jax.dressing import Inference, Simulation, dress, infer_block, run_simulation
 from physxnet_jax.errors import PhysXNetError
-from physxnet_jax.evaluation import network
-from physxnet_jax.garment import template
+from physxnet_jax.evaluation import PEER_CASES, network, surface_faults
+from physxnet_jax.garment import refine_garment, template
 from physxnet_jax.models import load_predictor
 from physxnet_jax.motion import animate, load_motion
+from physxnet_jax.simulation import Scene, prepare_scene
 
 
 def test_lbs_is_linear_blend_skinning(body, rest):
@@ -46,6 +47,25 @@ def test_clips_of_other_lengths_are_not_recompiled():
     assert infer_block._cache_size() == programs
     dress("walk", ["bottom"], method="lbs", frames=3, inference=Inference(collisions=False))
     assert infer_block._cache_size() == programs + 1, "another program is one more"
+
+
+@pytest.mark.release
+def test_refined_garments_return_on_their_own_vertices_without_skin_through_them():
+    """A tube with edges of 10 cm; the control doesn't keep its own triangles off the skin."""
+    case = PEER_CASES["edges_of_ten_centimetres"]
+    (tunic,), motion = case.garments(), case.motion()
+    finer = refine_garment(tunic, 0.03)
+    looked = np.asarray([0, 20, 39])
+    shares = []
+    for worn in (tunic, dataclasses.replace(finer, coarse_faces=None)):
+        simulation = Simulation(refine=0.03 if worn is tunic else None)
+        out = run_simulation(Scene((worn,)), motion, simulation)
+        x = out.positions[0]
+        assert x.shape == (40, worn.num_vertices, 3)
+        own = prepare_scene(Scene((tunic,))).assembly
+        faults = surface_faults(own, motion, x[:, : tunic.num_vertices], frames=looked)
+        shares.append(faults.visible_skin)
+    assert shares[0] < 2e-3 < 1e-2 < shares[1], shares
 
 
 @pytest.mark.release

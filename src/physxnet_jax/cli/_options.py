@@ -62,6 +62,9 @@ class SimulationOptions(EffectOptions):
     engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
     """bdf2: implicit, second order. blender, newton: external processes (PHYSXNET_BLENDER,
     PHYSXNET_NEWTON)."""
+    refine: float | None = None
+    """Split longer edges of the garments while they are simulated [m]; the result is on the
+    files' own vertices."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..body import Body
 from ..errors import FormatError
-from ..garment import Garment
+from ..garment import Garment, refine_garment
 from ..motion import Motion
 from ..simulation import (
     EFFECTS,
@@ -50,6 +50,8 @@ class Simulation:
         wind: Steady wind [m/s].
         self_contact: Whether garments collide with themselves.
         effects: Effects that replace the standard ones.
+        refine: Longest edge of the garments while they are simulated [m]: coarse meshes then
+            fold and lie on the body as fine ones do. The result is on their own vertices.
         resume: Folder that keeps finished blocks until the simulation completes.
     """
 
@@ -58,9 +60,12 @@ class Simulation:
     wind: tuple[float, float, float] | None = None
     self_contact: bool = False
     effects: tuple[Effect, ...] | None = None
+    refine: float | None = None
     resume: pathlib.Path | None = None
 
     def __post_init__(self) -> None:
+        if self.refine is not None and not self.refine > 0:
+            raise FormatError(f"refine is {self.refine}, expected a length in metres.")
         if self.accuracy not in PRESETS:
             raise FormatError(f"No accuracy '{self.accuracy}'; there are {', '.join(PRESETS)}.")
         options = {
@@ -137,6 +142,10 @@ def run_simulation(
     Raises:
         SimulationError: The cloth isn't finite.
     """
+    own = [g.num_vertices for g in scene.garments]
+    if simulation.refine is not None:
+        finer = tuple(refine_garment(g, simulation.refine) for g in scene.garments)
+        scene = dataclasses.replace(scene, garments=finer)
     ticks, done = [time.perf_counter()], [0]
 
     def tick(frames: int, total: int) -> None:
@@ -154,6 +163,8 @@ def run_simulation(
             prepare_scene(scene), [motion], solver=solver, progress=tick, resume=simulation.resume
         )[0]
     rollout.check()
+    positions = tuple(x[:, :n] for x, n in zip(rollout.positions, own, strict=True))
+    rollout = dataclasses.replace(rollout, positions=positions)
     if stages is not None:
         durations = 1e3 * np.diff(ticks)
         # The first call may report frames that an earlier run finished.

@@ -21,6 +21,7 @@ from ._load import (
     load_garment as load_garment,
 )
 from ._locate import locate_on_body as locate_on_body
+from ._refine import refine_garment as refine_garment
 from ._repair import (
     MeshHealth as MeshHealth,
     clean as clean,

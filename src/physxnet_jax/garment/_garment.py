@@ -96,6 +96,8 @@ class Garment:
         name: Name used in tables and files.
         polygons: Polygons and materials of the source file, for writing; None if there are
             only triangles.
+        coarse_faces: Triangles of the mesh that this one refines, on its first vertices. They,
+            too, are kept off the skin. None if it refines none.
     """
 
     mesh: TriMesh
@@ -108,6 +110,7 @@ class Garment:
     template: Template = dataclasses.field(metadata={"static": True})
     name: str = dataclasses.field(metadata={"static": True})
     polygons: Polygons | None = dataclasses.field(default=None, metadata={"static": True})
+    coarse_faces: Int[Array, "coarse 3"] | None = None
 
     @property
     def num_vertices(self) -> int:

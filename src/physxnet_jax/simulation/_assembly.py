@@ -30,6 +30,7 @@ class Assembly:
         membrane: Stiffness along warp, weft and in shear [N/m], shape [faces, 3].
         loose: Vertices that may touch any limb (skirts), shape [vertices].
         parts: First vertex of each garment, followed by the number of vertices.
+        coarse_faces: Triangles of the meshes that garments refine, shape [coarse, 3].
     """
 
     body: Body
@@ -46,6 +47,7 @@ class Assembly:
     membrane: Float[np.ndarray, "faces 3"]
     loose: Bool[np.ndarray, " vertices"]
     parts: tuple[int, ...]
+    coarse_faces: Int[np.ndarray, "coarse 3"]
 
 
 def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " shapes"]) -> Assembly:
@@ -54,7 +56,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
     rest, faces, mass, pinned, weights = [], [], [], [], []
     per_vertex: dict[str, list] = {"thickness": [], "friction": []}
     per_face: dict[str, list] = {"stretch": [], "bend": [], "membrane": []}
-    loose = []
+    loose, coarse = [], [np.zeros((0, 3), np.int64)]
     parts = [0]
     for g in garments:
         x = np.asarray(g.rest_vertices(rest_body), dtype=np.float64)
@@ -68,6 +70,8 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         m = np.maximum(m, 1e-3 * max(float(m.mean()), 1e-9))
         rest.append(x)
         faces.append(f + parts[-1])
+        if g.coarse_faces is not None:
+            coarse.append(np.asarray(g.coarse_faces) + parts[-1])
         mass.append(m)
         pinned.append(np.asarray(g.pinned))
         weights.append(np.asarray(g.skin, dtype=np.float64))
@@ -94,6 +98,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         cat(per_face["membrane"]),
         cat(loose),
         tuple(parts),
+        cat(coarse),
     )
 
 

@@ -81,7 +81,8 @@ class BodyContact(Effect):
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Builds patches around skin vertices and the first skin vertex of each search."""
         reach = _RELIEF_REACH * min(_edge_length(assembly), self.sample_spacing)
-        samples = sample_faces(assembly.rest, assembly.faces, self.sample_spacing)
+        faces = np.concatenate([assembly.faces, assembly.coarse_faces])
+        samples = sample_faces(assembly.rest, faces, self.sample_spacing)
         free = np.asarray(inverse_mass) > 0
         assembly = with_samples(assembly, samples)
         body = assembly.body

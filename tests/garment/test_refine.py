@@ -1,0 +1,58 @@
+"""Refined garments: same vertices first, everything else between them."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.body import load_body
+from physxnet_jax.errors import MeshError
+from physxnet_jax.garment import free_garment, refine_garment, square_sheet, template
+from physxnet_jax.geometry import mesh_edges
+
+
+def test_vertices_stay_edges_shorten_and_everything_is_interpolated():
+    coarse = template("bottom")
+    fine = refine_garment(coarse, 0.012)
+    n = coarse.num_vertices
+    assert fine.num_vertices > 2 * n
+    x = np.asarray(fine.mesh.vertices)
+    ends = mesh_edges(np.asarray(fine.mesh.faces)).vertices
+    assert np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1).max() <= 0.012
+    np.testing.assert_array_equal(x[:n], np.asarray(coarse.mesh.vertices))
+    np.testing.assert_allclose(np.asarray(fine.skin).sum(axis=1), 1.0, atol=1e-5)
+    body = load_body()
+    heavy = body.rest_vertices(body.shape(weight_up=1.0))
+    rest = body.rest_vertices(body.default_shape())
+    other, same = np.asarray(fine.rest_vertices(heavy)), np.asarray(fine.rest_vertices(rest))
+    np.testing.assert_allclose(same, x, atol=2e-5)
+    np.testing.assert_allclose(other[:n], np.asarray(coarse.rest_vertices(heavy)), atol=1e-5)
+    # On another body, too, midpoints of the first split lie midway.
+    once = refine_garment(square_sheet(2, 0.2), 0.15)
+    np.testing.assert_allclose(
+        np.asarray(once.mesh.vertices)[4:].mean(axis=0),
+        np.asarray(once.mesh.vertices)[:4].mean(axis=0),
+        atol=1e-6,
+    )
+
+
+def test_only_vertices_between_held_ones_are_held():
+    held = square_sheet(3, 0.2, pinned=np.arange(3))
+    fine = refine_garment(held, 0.03)
+    x, pinned = np.asarray(fine.mesh.vertices), np.asarray(fine.pinned)
+    edge = np.asarray(held.mesh.vertices)[:3]
+    on_edge = np.abs(x - edge[0]) @ (np.abs(edge[2] - edge[0]) < 1e-9) < 1e-6
+    np.testing.assert_array_equal(pinned, on_edge)
+    assert pinned.sum() > 3
+
+
+def test_triangles_without_area_and_impossible_lengths():
+    v = np.asarray([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [0, 0.1, 0]], float) + [0, 0, 1.5]
+    sheet = square_sheet(2, 0.2)
+    fine = refine_garment(free_garment(v, np.asarray([[0, 1, 2], [0, 2, 3]])), 0.04)
+    for field in ("skin", "offset", "ref_weights"):
+        assert np.isfinite(np.asarray(getattr(fine, field))).all()
+    same = refine_garment(sheet, 1.0)
+    assert same.num_vertices == 4
+    with pytest.raises(MeshError, match="vertices"):
+        refine_garment(sheet, 1e-5)
+    assert jnp.all(same.mesh.vertices == sheet.mesh.vertices)
