@@ -26,7 +26,7 @@ from physxnet_jax.errors import (
     PhysXNetError,
     SimulationError,
 )
-from physxnet_jax.evaluation import price_effects, recommend_effects
+from physxnet_jax.evaluation import judge_effects, price_effects, recommend_effects
 from physxnet_jax.evaluation._price import Price
 from physxnet_jax.garment import FABRICS, square_sheet, template
 from physxnet_jax.io import write_obj
@@ -274,14 +274,14 @@ def test_effect_costs_separate_relevant_from_irrelevant_effects(tmp_path, capsys
     motion = dataclasses.replace(motion, rotations=motion.rotations[:10], root=motion.root[:10])
     scene = Scene((g,), (Gravity(), Stretch(), BodyContact(), Pin()))
     solver = XPBD(4, 1)
-    rows = price_effects(scene, motion, solver=solver)
+    rows, found = recommend_effects(scene, motion, solver=solver)
     by = {r.without: r for r in rows}
     assert list(by) == ["", "Gravity", "Stretch", "BodyContact", "Pin"]
     assert by[""].rms_mm == 0 and by["BodyContact"].rms_mm == 0
     assert by["Gravity"].rms_mm > 10 and by["Pin"].rms_mm > 100
     assert by["BodyContact"].mflop < by[""].mflop and by["Gravity"].mflop < by[""].mflop
     assert by["Stretch"].strain_p99 > by[""].strain_p99
-    advice = {a.effect: a for a in recommend_effects(scene, motion, solver=solver, rows=rows)}
+    advice = {a.effect: a for a in found}
     assert advice["Gravity"].needed and advice["Pin"].needed
     assert not advice["BodyContact"].needed
     assert not advice["SelfContact"].needed and "Cloth never comes" in advice["SelfContact"].why
@@ -330,14 +330,12 @@ def test_recommended_scene_is_written_and_simulated(tmp_path, capsys):
 
 
 def test_changes_below_the_noise_floor_are_no_measurable_effect():
-    scene = Scene((template("bottom"),), (Gravity(), BodyContact(), Pin()))
-    motion = load_motion("balance", fps=30.0)
     base = Price("", 2, 0.0, 0.0, 0.1, 0.0, 10.0, 1.0, 1.0, 6.0)
     rows = [
         base,
         *(dataclasses.replace(base, without=n, rms_mm=m) for n, m in (("A", 5.0), ("B", 7.0))),
     ]
-    below, above = recommend_effects(scene, motion, solver=XPBD(1, 1), rows=rows)[:2]
+    below, above = judge_effects(rows)
     assert not below.needed and below.why.startswith("No measurable effect")
     assert above.needed and "No measurable" not in above.why
 

@@ -33,19 +33,19 @@ def price(command: Effects, console: Console) -> int:
         )
     solver = PRESETS[command.simulation.accuracy or job.accuracy].at_rate(job.motion.fps)
     with progress_bars(console) as bars:
-        rows = price_effects(
-            job.scene, job.motion, solver=solver, progress=lambda d, t: bars("effects", d, t)
-        )
-        advice = []
         if command.recommend:
-            advice = recommend_effects(
+            rows, advice = recommend_effects(
                 job.scene,
                 job.motion,
                 solver=solver,
                 tolerance=1e-3 * command.tolerance,
-                rows=rows,
-                progress=lambda d, t: bars("recommendation", d, t),
+                progress=lambda d, t: bars("effects", d, t),
             )
+        else:
+            rows = price_effects(
+                job.scene, job.motion, solver=solver, progress=lambda d, t: bars("effects", d, t)
+            )
+            advice = []
     table = Table(
         title=f"{rows[0].frames} frames: the scene, then without each of its effects",
         caption=f"two runs that differ by 1e-6 m: {rows[0].jitter_mm:.2f} mm; strain: 99th"

@@ -74,6 +74,7 @@ from ._network_bench import (
 )
 from ._penetration import penetration as penetration
 from ._price import (
+    judge_effects as judge_effects,
     price_effects as price_effects,
     recommend_effects as recommend_effects,
     recommended_effects as recommended_effects,

@@ -22,11 +22,11 @@ from ..simulation import (
     prepare_scene,
     simulate_batch,
 )
-from ..simulation.effects import Air, BodyContact, Damping, LayerContact, SelfContact
+from ..simulation.effects import Air, BodyContact, Damping, LayerContact, Pin, SelfContact
 from ._penetration import penetration
 from ._strain import edge_strain
 
-_SAMPLED_FRAMES = 5
+_SAMPLED_FRAMES = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,25 +118,39 @@ def price_effects(
     Returns:
         The whole scene's row, then one for each effect.
     """
-    variants = [("", scene.effects)]
-    variants += [
-        (type(e).__name__, tuple(x for x in scene.effects if x is not e)) for e in scene.effects
-    ]
-    rows: list[Price] = []
-    whole: Rollout | None = None
-    floor = 0.0
-    for k, (name, effects) in enumerate(variants):
-        row, rollout = _measure(
-            dataclasses.replace(scene, effects=effects), motion, solver, whole, name
-        )
-        if whole is None:
-            whole, floor = rollout, _noise_floor(scene, motion, solver, rollout)
-        rows.append(dataclasses.replace(row, jitter_mm=floor))
-        # The program of these effects is never run again.
+    return _price(scene, motion, solver, progress)[0]
+
+
+def _price(
+    scene: Scene,
+    motion: Motion,
+    solver: Solver,
+    progress: Callable[[int, int], None] | None,
+) -> tuple[list[Price], Rollout]:
+    """The rows of `price_effects`, and the whole scene's rollout."""
+    prepared = prepare_scene(scene)
+    base, whole = _measure(prepared, motion, solver, None, "")
+    base = dataclasses.replace(base, jitter_mm=_noise_floor(prepared, motion, solver, whole))
+    rows = [base]
+    count = len(scene.effects)
+    for k, e in enumerate(scene.effects):
+        # The program before isn't run again.
         advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
         if progress is not None:
-            progress(k + 1, len(variants))
-    return rows
+            progress(k + 1, count + 1)
+        others = tuple(x for x in scene.effects if x is not e)
+        if isinstance(e, Pin):
+            # Held vertices have another mass.
+            rest = prepare_scene(dataclasses.replace(scene, effects=others))
+        else:
+            kept = tuple(x for i, x in enumerate(prepared.effects) if i != k)
+            rest = dataclasses.replace(prepared, effects=kept)
+        row, _ = _measure(rest, motion, solver, whole, type(e).__name__)
+        rows.append(dataclasses.replace(row, jitter_mm=base.jitter_mm))
+    advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
+    if progress is not None:
+        progress(count + 1, count + 1)
+    return rows, whole
 
 
 def recommend_effects(
@@ -145,9 +159,8 @@ def recommend_effects(
     *,
     solver: Solver,
     tolerance: float = 2e-3,
-    rows: Sequence[Price] | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> list[Advice]:
+) -> tuple[list[Price], list[Advice]]:
     """Measures which effects matter for a scene.
 
     The scene's effects are left out one by one (`price_effects`). Drag of still air,
@@ -158,40 +171,23 @@ def recommend_effects(
         motion: The motion.
         solver: The solver.
         tolerance: RMS distance of the cloth above which an effect matters [m].
-        rows: Result of `price_effects`, if it was called before.
         progress: Called with the variants done and the total.
+
+    Returns:
+        The rows of `price_effects`, and what follows from them.
     """
-    rows = price_effects(scene, motion, solver=solver, progress=progress) if rows is None else rows
-    base = rows[0]
-    out = []
-    for r in rows[1:]:
-        inside = r.inside_share - base.inside_share
-        strain = r.strain_p99 - base.strain_p99
-        needed = r.rms_mm > max(1e3 * tolerance, r.jitter_mm) or inside > 1e-3 or strain > 0.05
-        seen = "" if r.rms_mm > r.jitter_mm else "No measurable effect. "
-        out.append(
-            Advice(
-                r.without,
-                needed,
-                f"{seen}Without it the cloth moves by {r.rms_mm:.1f} mm (inside the body"
-                f" {100 * inside:+.1f} %, strain {100 * strain:+.0f} %); it costs"
-                f" {base.ms_per_frame - r.ms_per_frame:.1f} ms a frame.",
-            )
-        )
+    rows, whole = _price(scene, motion, solver, progress)
+    base, out = rows[0], judge_effects(rows, tolerance)
     kinds = {type(e) for e in scene.effects}
     extra: list[Effect] = [Air()] if Air not in kinds else []
     if SelfContact not in kinds:
         extra.append(SelfContact())
     if LayerContact not in kinds and len(scene.garments) > 1:
         extra.append(LayerContact())
-    whole: Rollout | None = None
     for k, e in enumerate(extra):
-        if whole is None:
-            whole = _measure(scene, motion, solver, None, "")[1]
         effects = _with_effect(scene.effects, e)
-        row, rollout = _measure(
-            dataclasses.replace(scene, effects=effects), motion, solver, whole, ""
-        )
+        more = prepare_scene(dataclasses.replace(scene, effects=effects))
+        row, rollout = _measure(more, motion, solver, whole, "")
         name = type(e).__name__
         seen = "" if row.rms_mm > base.jitter_mm else "No measurable effect. "
         reason = (
@@ -211,22 +207,47 @@ def recommend_effects(
         advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
         if progress is not None:
             progress(k + 1, len(extra))
+    return rows, out
+
+
+def judge_effects(rows: Sequence[Price], tolerance: float = 2e-3) -> list[Advice]:
+    """Whether the effects of a scene matter, by the rows of `price_effects`.
+
+    Args:
+        rows: The whole scene, then without each effect.
+        tolerance: RMS distance of the cloth above which an effect matters [m].
+    """
+    base = rows[0]
+    out = []
+    for r in rows[1:]:
+        inside = r.inside_share - base.inside_share
+        strain = r.strain_p99 - base.strain_p99
+        needed = r.rms_mm > max(1e3 * tolerance, r.jitter_mm) or inside > 1e-3 or strain > 0.05
+        seen = "" if r.rms_mm > r.jitter_mm else "No measurable effect. "
+        out.append(
+            Advice(
+                r.without,
+                needed,
+                f"{seen}Without it the cloth moves by {r.rms_mm:.1f} mm (inside the body"
+                f" {100 * inside:+.1f} %, strain {100 * strain:+.0f} %); it costs"
+                f" {base.ms_per_frame - r.ms_per_frame:.1f} ms a frame.",
+            )
+        )
     return out
 
 
-def _noise_floor(scene: Scene, motion: Motion, solver: Solver, whole: Rollout) -> float:
+def _noise_floor(scene: PreparedScene, motion: Motion, solver: Solver, whole: Rollout) -> float:
     """RMS distance of two runs that differ by 1e-6 m [mm]."""
     noise = np.random.default_rng(0).normal(0.0, 1e-6, motion.root.shape)
     moved = dataclasses.replace(motion, root=motion.root + jnp.asarray(noise, jnp.float32))
-    (again,) = simulate_batch(prepare_scene(scene), [moved], solver=solver)
+    (again,) = simulate_batch(scene, [moved], solver=solver)
     gap = np.concatenate(again.positions, axis=1) - np.concatenate(whole.positions, axis=1)
     return 1e3 * float(np.sqrt(np.mean(np.sum(gap * gap, axis=2))))
 
 
 def _measure(
-    scene: Scene, motion: Motion, solver: Solver, whole: Rollout | None, name: str
+    prepared: PreparedScene, motion: Motion, solver: Solver, whole: Rollout | None, name: str
 ) -> tuple[Price, Rollout]:
-    prepared = prepare_scene(scene)
     flops = program_flops(prepared, solver, motion.fps)
     ticks = [time.perf_counter()]
     rollout = simulate_batch(
