@@ -7,7 +7,8 @@ Result:  experiments/results/penetration.json and .md: for each action and templ
          share of cloth vertices inside the body, how much of that lies where the body
          folds or passes through itself (pinched: no place above the skin is free), the
          rest (avoidable), the deepest vertex, the share of skin that sticks out of the
-         cloth over it, and strain. Measured on meshes, not by the simulator.
+         cloth over it, strain, and, over every tenth frame, visible skin and the share of faces
+         that cross other faces of the garment. Measured on meshes, not by the simulator.
 """
 
 import argparse
@@ -20,12 +21,14 @@ import numpy as np
 from rich.progress import track
 
 from physxnet_jax.data import load_action, read_protocol
-from physxnet_jax.evaluation import edge_strain, penetration
+from physxnet_jax.evaluation import edge_strain, penetration, surface_faults
 from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import TEMPLATES, template
 from physxnet_jax.simulation import PRESETS, Scene, Status, prepare_scene, simulate_batch
 
 RESULTS = pathlib.Path(__file__).parent / "results"
+# Frames between those at which visible skin is measured.
+STRIDE = 10
 
 
 def one(name: str, action, folder: pathlib.Path, accuracy: str) -> dict:
@@ -35,6 +38,7 @@ def one(name: str, action, folder: pathlib.Path, accuracy: str) -> dict:
     x = out.positions[0]
     seen = penetration(scene.assembly, motion, x)
     strain = edge_strain(scene.assembly, x)
+    faults = surface_faults(scene.assembly, motion, x, frames=np.arange(0, len(x), STRIDE))
     acceleration = np.diff(x, n=2, axis=0) * motion.fps**2
     return {
         "action": action.name,
@@ -47,6 +51,8 @@ def one(name: str, action, folder: pathlib.Path, accuracy: str) -> dict:
         "deepest_avoidable_mm": 1e3 * float(np.where(seen.pinched, 0, seen.depth).max()),
         "frames_with_any_inside": int(seen.cloth_inside.any(axis=1).sum()),
         "skin_outside_share": float(seen.skin_outside.mean()),
+        "visible_skin": faults.visible_skin,
+        "self_crossing": faults.self_crossing,
         "strain_p99": float(np.quantile(strain, 0.99)),
         "strain_max": float(strain.max()),
         "acceleration_median": float(np.median(np.linalg.norm(acceleration, axis=2))),
@@ -74,8 +80,8 @@ def main() -> None:
             part.write_text(json.dumps({"accuracy": words.accuracy, "rows": rows}, indent=1) + "\n")
     lines = [
         "| template | frames | inside | pinched | avoidable | deepest mm (avoidable) |"
-        " skin outside | strain p99 |",
-        "|---|---|---|---|---|---|---|---|",
+        " skin outside | visible skin (worst action) | self-crossing | strain p99 |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for name in TEMPLATES:
         mine = [r for r in rows if r["template"] == name]
@@ -89,7 +95,9 @@ def main() -> None:
             f" {100 * mean('pinched_share'):.3f} % | {100 * mean('avoidable_share'):.3f} % |"
             f" {max(r['deepest_mm'] for r in mine):.1f}"
             f" ({max(r['deepest_avoidable_mm'] for r in mine):.1f}) |"
-            f" {100 * mean('skin_outside_share'):.3f} % | {mean('strain_p99'):.3f} |"
+            f" {100 * mean('skin_outside_share'):.3f} % | {100 * mean('visible_skin'):.3f} %"
+            f" ({100 * max(r['visible_skin'] for r in mine):.3f} %) |"
+            f" {100 * mean('self_crossing'):.2f} % | {mean('strain_p99'):.3f} |"
         )
     with atomic_write(path.with_suffix(".md")) as part:
         part.write_text("\n".join(lines) + "\n")
