@@ -14,7 +14,7 @@ QUIET = {
     "missed": 15.0,
     "pinched": 15.0,
     "speed_max": 5.0,
-    "layers_crossed": 0.0,
+    "layers_crossed": 4.0,
     "overflow": 0.0,
 }
 
@@ -38,7 +38,7 @@ def test_a_few_stretched_or_pinched_places_raise_nothing():
         (Status.MISSED, {"missed": 25.0}),
         (Status.FAST, {"speed_max": 80.0}),
         (Status.PINCHED, {"pinched": 25.0}),
-        (Status.CROSSED, {"layers_crossed": 1.0}),
+        (Status.CROSSED, {"layers_crossed": 6.0}),
         (Status.OVERFLOW, {"overflow": 1.0}),
         (Status.STRAINED, {"strain_p99": float("nan")}),
     ],

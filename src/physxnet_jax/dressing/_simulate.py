@@ -163,8 +163,12 @@ def run_simulation(
             prepare_scene(scene), [motion], solver=solver, progress=tick, resume=simulation.resume
         )[0]
     rollout.check()
-    positions = tuple(x[:, :n] for x, n in zip(rollout.positions, own, strict=True))
-    rollout = dataclasses.replace(rollout, positions=positions)
+    if simulation.refine is not None:
+        rollout = dataclasses.replace(
+            rollout,
+            positions=tuple(x[:, :n] for x, n in zip(rollout.positions, own, strict=True)),
+            vertices=sum(x.shape[1] for x in rollout.positions),
+        )
     if stages is not None:
         durations = 1e3 * np.diff(ticks)
         # The first call may report frames that an earlier run finished.

@@ -27,7 +27,7 @@ class Status(enum.IntFlag):
     PINCHED = 64
     """Many vertices lie inside another limb because the body intersects itself."""
     CROSSED = 128
-    """Some vertices of two layers are in the wrong order."""
+    """More than one vertex in two hundred is on the wrong side of another layer."""
     OVERFLOW = 256
     """A grid cell of `SelfContact` received more vertices than it can hold."""
 
@@ -40,6 +40,8 @@ class Status(enum.IntFlag):
 _STRAIN, _INSIDE, _SPEED = 0.5, 0.01, 50.0
 # Single vertices in armpits do no harm: this share of all is "many".
 _MANY = 0.02
+# Between layers less than that shows.
+_CROSSING = 0.005
 _ADVICE = {
     Status.NONFINITE: "look for a jump in the motion, or try --accuracy fine",
     Status.UNCONVERGED: "--accuracy fine",
@@ -73,12 +75,14 @@ class Rollout:
             ``pinched`` (vertices), ``layers_crossed``, ``layers_depth`` [m],
             ``self_gap`` [m] and ``overflow``; ``energy_...`` [J] if requested.
         name: Name of the motion.
+        vertices: Number of vertices that were simulated, if there were more than are returned.
     """
 
     positions: tuple[Float[np.ndarray, "frames _ 3"], ...]
     fps: float
     diagnostics: dict[str, np.ndarray]
     name: str = ""
+    vertices: int | None = None
 
     @property
     def finite(self) -> Bool[np.ndarray, " frames"]:
@@ -100,7 +104,8 @@ class Rollout:
         """`Status` bits of each frame."""
         d = self.diagnostics
         nothing = np.zeros(len(self.finite))
-        many = _MANY * sum(x.shape[1] for x in self.positions)
+        vertices = self.vertices or sum(x.shape[1] for x in self.positions)
+        many = _MANY * vertices
 
         def bit(flag: Status, wrong: np.ndarray) -> np.ndarray:
             return np.where(wrong, int(flag), 0)
@@ -113,7 +118,7 @@ class Rollout:
             | bit(Status.MISSED, d.get("missed", nothing) > many)
             | bit(Status.FAST, ~(d["speed_max"] <= _SPEED))
             | bit(Status.PINCHED, d.get("pinched", nothing) > many)
-            | bit(Status.CROSSED, d.get("layers_crossed", nothing) > 0)
+            | bit(Status.CROSSED, d.get("layers_crossed", nothing) > _CROSSING * vertices)
             | bit(Status.OVERFLOW, d.get("overflow", nothing) > 0)
         )
 
