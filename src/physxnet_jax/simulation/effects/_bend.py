@@ -235,12 +235,7 @@ class _Bend(Prepared):
         return dataclasses.replace(self, values=values * self.weight[owner])
 
     def begin(self, base: Array, start: None, end: None, clock: Clock, state: Any) -> tuple:
-        h = self.hinges
-        first = base[h.index[0]]
-        flat = jnp.zeros_like(first)
-        for c, i in zip(h.coefficient[1:], h.index[1:], strict=True):
-            flat = flat + c * (base[i] - first)
-        return flat, () if self.values is None else self.rows.product(self.values, base)
+        return base, () if self.values is None else self.rows.product(self.values, base)
 
     def project(
         self,
@@ -259,9 +254,12 @@ class _Bend(Prepared):
         return displacement + moved
 
     def energy(self, displacement: Array, context: tuple) -> Array:
-        h, curvature = self.hinges, context[0]
+        h, base = self.hinges, context[0]
+        first = base[h.index[0]]
+        curvature = jnp.zeros_like(first)
         for c, i in zip(h.coefficient, h.index, strict=True):
-            curvature = curvature + c * displacement[i]
+            # The coefficients sum to 0.
+            curvature = curvature + c * ((base[i] - first) + displacement[i])
         return 0.5 * jnp.sum(curvature**2 / h.compliance, axis=(0, 1))
 
     def coupled(self) -> Int[np.ndarray, "blocks 2"]:
