@@ -88,7 +88,7 @@ def test_every_effect_is_listed():
 
 
 def test_simulation_page_holds_the_measured_tables():
-    for name in ("convergence", "sim_bench", "visible_skin"):
+    for name in ("convergence", "sim_bench", "visible_skin", "part_times", "batch_scaling"):
         block = re.search(rf"<!-- begin {name} -->\n(.*?)<!-- end {name} -->", TEXT, re.S)
         assert block and block.group(1) == (ROOT / f"experiments/results/{name}.md").read_text()
 

@@ -45,7 +45,7 @@ class BodyContact(Effect):
 
     Edges and faces of the cloth larger than ``sample_spacing`` are kept off the skin at sample
     points as well, so that no skin comes through a large triangle. Over features of the skin
-    smaller than a triangle the cloth keeps their height in addition to its thickness.
+    smaller than a triangle the corners lie as high as they are.
 
     Attributes:
         sample_spacing: Largest distance between points of the cloth that feel contact [m].
@@ -143,6 +143,8 @@ _COVER = 0.002
 _NEAR = 0.001
 # Skin farther than this from all cloth at rest is left out [m].
 _REACH = 0.30
+# Gap kept to the highest skin below a triangle [m].
+_CLEARANCE = 0.002
 # Distance from a triangle's middle to its corners, over the length of its edges.
 _RELIEF_REACH = 0.6
 
@@ -322,7 +324,8 @@ class _Contact(Prepared):
         far = jnp.sum(from_centre**2, axis=1) > self.radius[last] ** 2
         unit = n0 / jnp.sqrt(jnp.sum(n0 * n0, axis=1, keepdims=True) + 1e-12)
         later = self.pinch.room(end)
-        margin = self.thickness[..., None] + self._at(self.relief, face, weights)
+        over = self._at(self.relief, face, weights) + _CLEARANCE
+        margin = jnp.maximum(self.thickness[..., None], over)
         wanted, top = self._height_bounds(self._at(room, face, weights), margin)
         rise, fall = self._height_bounds(self._at(later, face, weights), margin)
         height = jnp.sum((base - p0) * unit, axis=1, keepdims=True)
