@@ -5,9 +5,11 @@ Cost:    two minutes on two cores; needs a C compiler (cc) for the yardstick.
 Result:  experiments/results/part_times.json and .md: for the dress on punch and the trousers on
          salsa (mocap/daz/060_12.bvh from 4 s) at `standard`, the time of each part on its own.
          Its floor is the time in which a compiled loop (C, one core, -O3) does the same
-         arithmetic on the same data; where no such loop was written, the larger of its bytes
-         over the bandwidth that a compiled copy reaches on as many bytes and of its operations
-         over the rate of a compiled multiply-add. All are medians; parts and loops take turns.
+         arithmetic on the same data (for the search of contact without the lists of loose cloth,
+         normals and bounds of heights: a lower floor than the work has); where no such loop was
+         written, the larger of its bytes over the bandwidth that a compiled copy reaches on as
+         many bytes and of its operations over the rate of a compiled multiply-add. All are
+         medians; parts and loops take turns.
          Last, the time of a whole frame, and of one without contact with the body.
 """
 
@@ -27,7 +29,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from rich.progress import track
-from scipy.spatial import KDTree
 
 import physxnet_jax as px
 from convergence import clip
@@ -252,7 +253,8 @@ def parts_of(garment: str, action: str, data: pathlib.Path, loops: ctypes.CDLL) 
     def add(name: str, calls: int, f: Any, words: tuple, repeats: int, touched: int) -> None:
         done = jax.jit(f)
         flops = operations(f, *words)
-        timed[name] = (calls, lambda: done(*words), 1.0 / repeats, touched, flops / repeats)
+        # XLA counts the body of a loop once.
+        timed[name] = (calls, lambda: done(*words), 1.0 / repeats, touched, flops)
 
     for e in begun.effects:
         name = type(e).__name__.strip("_")
@@ -281,8 +283,7 @@ def parts_of(garment: str, action: str, data: pathlib.Path, loops: ctypes.CDLL) 
 
             words = (e, still, context)
             add(f"{name}: substep", SOLVER.substeps, sweep, words, REPEATS, size_of(context, d3(x)))
-    # The loop that is timed runs `REPEATS` times, of which XLA counts one.
-    yard = yardsticks(begun, x, loops, h)
+    yard = yardsticks(begun, x, loops, h, skin(body_of(begun), rotations[FRAME], root[FRAME]))
     everything: dict[str, Callable[[], Any]] = {k: v[1] for k, v in timed.items()} | yard
     largest = max(v[3] for v in timed.values()) // 8
     source = np.zeros(largest, np.float32)
@@ -314,13 +315,13 @@ def d3(x: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     return x, x, x
 
 
-def nearest(x: jax.Array, body: np.ndarray) -> np.ndarray:
-    """Nearest skin vertex of each vertex."""
-    return np.asarray(KDTree(body).query(np.asarray(x)[:, :, 0])[1], np.int32)
+def body_of(system: Any) -> Any:
+    """The skin that contact poses."""
+    return next(e.skin for e in system.effects if type(e).__name__ == "_Contact")
 
 
 def yardsticks(
-    system: Any, x: jax.Array, loops: ctypes.CDLL, h: float
+    system: Any, x: jax.Array, loops: ctypes.CDLL, h: float, posed: Any
 ) -> dict[str, Callable[[], None]]:
     """Compiled loops with the data of the effects."""
     n = len(x)
@@ -345,9 +346,17 @@ def yardsticks(
             flat = np.zeros(n, np.float32)
             words = (zero, zero, up, zero, flat, flat, flat, 0.5, 0.01, zero, zero.copy())
             out["loop Contact: substep"] = repeated(call(loops.contact, n, *words))
-            body = np.asarray(e.skin.rest)
-            # The vertices of loose cloth start at the nearest of their list here as well.
-            start = np.asarray(e.start) if not e.loose.size else nearest(x, body)
+            body = np.ascontiguousarray(np.asarray(posed.points)[:, :, 0])
+            # Tight cloth starts as at rest, loose cloth at the nearest of its list.
+            start = np.zeros(n, np.int32)
+            tight = np.asarray(e.tight)
+            own = tight < n
+            start[tight[own]] = np.asarray(e.start)[own]
+            loose = np.asarray(e.loose)
+            loose, listed = loose[loose < n], np.asarray(e.listed)[:, loose < n]
+            away = body[listed] - np.asarray(x)[loose, :, 0][None]
+            best = (away**2).sum(axis=2).argmin(axis=0)
+            start[loose] = listed[best, np.arange(len(loose))]
             sample = np.asarray(e.pinch.samples)
             words = (e.hops, len(e.ring), len(body), len(e.table), *map(np.asarray, (e.ring,)))
             words += (np.asarray(e.corners), np.asarray(x), body, start, len(sample), sample)

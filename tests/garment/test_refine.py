@@ -1,5 +1,7 @@
 """Refined garments: same vertices first, everything else between them."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import pytest
 from physxnet_jax.body import load_body
 from physxnet_jax.errors import MeshError
 from physxnet_jax.garment import free_garment, refine_garment, square_sheet, template
-from physxnet_jax.geometry import mesh_edges
+from physxnet_jax.geometry import closest_points, make_mesh, mesh_edges
 
 
 def test_vertices_stay_edges_shorten_and_everything_is_interpolated():
@@ -26,13 +28,23 @@ def test_vertices_stay_edges_shorten_and_everything_is_interpolated():
     other, same = np.asarray(fine.rest_vertices(heavy)), np.asarray(fine.rest_vertices(rest))
     np.testing.assert_allclose(same, x, atol=2e-5)
     np.testing.assert_allclose(other[:n], np.asarray(coarse.rest_vertices(heavy)), atol=1e-5)
-    # On another body, too, midpoints of the first split lie midway.
-    once = refine_garment(square_sheet(2, 0.2), 0.15)
-    np.testing.assert_allclose(
-        np.asarray(once.mesh.vertices)[4:].mean(axis=0),
-        np.asarray(once.mesh.vertices)[:4].mean(axis=0),
-        atol=1e-6,
-    )
+    # New vertices lie on the coarse triangles on this body and on another.
+    for shape, moved in ((rest, same), (heavy, other)):
+        corners = np.asarray(coarse.rest_vertices(shape))
+        distance = closest_points(make_mesh(corners, coarse.mesh.faces), jnp.asarray(moved[n:]))
+        assert float(distance.squared_distance.max()) < (2e-4) ** 2
+
+
+def test_a_band_of_held_vertices_has_no_holes():
+    top = template("top")
+    x = np.asarray(top.mesh.vertices)
+    held = x[:, 1] > np.quantile(x[:, 1], 0.9)
+    fine = refine_garment(dataclasses.replace(top, pinned=jnp.asarray(held)), 0.012)
+    faces = held[np.asarray(top.mesh.faces)].all(axis=1)
+    band = make_mesh(x, np.asarray(top.mesh.faces)[faces])
+    away = closest_points(band, fine.mesh.vertices).squared_distance
+    inside = np.asarray(away) < 1e-12
+    assert (np.asarray(fine.pinned)[inside]).all() and inside.sum() > held.sum()
 
 
 def test_only_vertices_between_held_ones_are_held():

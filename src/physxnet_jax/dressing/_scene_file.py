@@ -137,7 +137,7 @@ def make_scene(
     Args:
         motion: A motion, a motion file, or the name of a built-in clip.
         wear: Garments, garment files or template names; sorted into layer order.
-        simulation: Accuracy and effects.
+        simulation: Accuracy and effects; its other options belong to `run_simulation`.
         also: Additional effects; each replaces an effect of the same type.
         fps: Frames per second; by default that of a `Motion`, else 30.
         start: Start time within the motion [s].

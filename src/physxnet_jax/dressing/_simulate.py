@@ -51,7 +51,8 @@ class Simulation:
         self_contact: Whether garments collide with themselves.
         effects: Effects that replace the standard ones.
         refine: Longest edge of the garments while they are simulated [m]: coarse meshes then
-            fold and lie on the body as fine ones do. The result is on their own vertices.
+            fold and lie on the body as fine ones do. The result is on their own vertices; errors
+            and diagnostics are of the finer ones.
         resume: Folder that keeps finished blocks until the simulation completes.
     """
 

@@ -176,14 +176,20 @@ def recommend_effects(
     Returns:
         The rows of `price_effects`, and what follows from them.
     """
-    rows, whole = _price(scene, motion, solver, progress)
-    base, out = rows[0], judge_effects(rows, tolerance)
     kinds = {type(e) for e in scene.effects}
     extra: list[Effect] = [Air()] if Air not in kinds else []
     if SelfContact not in kinds:
         extra.append(SelfContact())
     if LayerContact not in kinds and len(scene.garments) > 1:
         extra.append(LayerContact())
+    total = 1 + len(scene.effects) + len(extra)
+
+    def tick(done: int, _: int) -> None:
+        if progress is not None:
+            progress(done, total)
+
+    rows, whole = _price(scene, motion, solver, tick)
+    base, out = rows[0], judge_effects(rows, tolerance)
     for k, e in enumerate(extra):
         effects = _with_effect(scene.effects, e)
         more = prepare_scene(dataclasses.replace(scene, effects=effects))
@@ -205,8 +211,7 @@ def recommend_effects(
                 reason = f"Cloth never comes {near}."
         out.append(Advice(name, needed, reason, e))
         advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
-        if progress is not None:
-            progress(k + 1, len(extra))
+        tick(1 + len(scene.effects) + k + 1, total)
     return rows, out
 
 

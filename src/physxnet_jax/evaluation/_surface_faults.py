@@ -20,6 +20,10 @@ from ..simulation import Assembly
 
 # Skin below cloth at rest, as far away as this along its normal, is covered [m].
 _COVER = 0.3
+# Rays start below the skin, and again past a shell that they hit [m].
+_BELOW, _PAST = 0.01, 1e-4
+# Shells that a ray looks through.
+_SHELLS = 3
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,11 +106,20 @@ def _covered_faces(
     """Triangles of skin, or of a garment, with cloth over them at rest."""
     x = jnp.asarray(inner, jnp.float32)
     normals = vertex_normals(x, jnp.asarray(faces))
+    mesh = make_mesh(outer, outer_faces)
+    over, open_ = np.zeros(len(x), bool), np.ones(len(x), bool)
     # From a little below: cloth may rest on the skin or in it.
-    start = x - 0.01 * normals
-    hits = cast_rays(make_mesh(outer, outer_faces), start, normals, max_distance=_COVER)
-    # Through its inner side: a bare arm faces the outer side of cloth on the trunk.
-    a, b, c = (outer[corner] for corner in outer_faces[np.asarray(hits.face)].T)
-    leaves = np.einsum("ij,ij->i", np.cross(b - a, c - a), np.asarray(normals)) > 0
-    over: Bool[np.ndarray, "faces 3"] = (np.asarray(hits.valid) & leaves)[faces]
-    return np.logical_or.reduce(over, axis=1)
+    gone = np.full(len(x), -_BELOW)
+    for _ in range(_SHELLS):
+        start = x + jnp.asarray(gone, jnp.float32)[:, None] * normals
+        hits = cast_rays(mesh, start, normals, max_distance=_COVER)
+        # Through its inner side: a bare arm faces the outer side of cloth on the trunk, and
+        # the lining of a coat faces the skin with its own.
+        a, b, c = (outer[corner] for corner in outer_faces[np.asarray(hits.face)].T)
+        leaves = np.einsum("ij,ij->i", np.cross(b - a, c - a), np.asarray(normals)) > 0
+        open_ &= np.asarray(hits.valid)
+        over |= open_ & leaves
+        gone = np.where(open_, gone + np.asarray(hits.distance) + _PAST, gone)
+        open_ &= gone < _COVER
+    covered: Bool[np.ndarray, "faces 3"] = over[faces]
+    return np.logical_or.reduce(covered, axis=1)

@@ -22,7 +22,8 @@ class Fabric:
         density: Mass per area [kg/m^2].
         stretch: Membrane stiffness of springs along edges [N/m].
         bend: Bending stiffness [N m].
-        thickness: Gap kept between cloth and skin [m].
+        thickness: Smallest gap kept between cloth and skin [m]; over convex skin large triangles
+            keep more.
         friction: Coulomb coefficient between cloth and skin [1].
         warp: Stiffness of the membrane along the warp [N/m]; ``stretch`` if None.
         weft: Stiffness of the membrane along the weft [N/m]; ``stretch`` if None.

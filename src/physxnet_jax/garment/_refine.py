@@ -9,8 +9,8 @@ from jaxtyping import Float
 from ._garment import Garment
 from ._repair import subdivide
 
-# Weights below this are rounding [1].
-_ROUNDING = 1e-6
+# Smaller weights are rounding: true ones are multiples of a power of a half [1].
+_ROUNDING = 1e-4
 
 
 def refine_garment(garment: Garment, longest: float) -> Garment:
@@ -39,6 +39,7 @@ def refine_garment(garment: Garment, longest: float) -> Garment:
     at = jnp.asarray(corners)
     skin = jnp.sum(share * garment.skin[at], axis=1)
     held = np.asarray(garment.pinned)[corners] | (weights < _ROUNDING)
+    own = garment.coarse_faces
     return dataclasses.replace(
         garment,
         mesh=mesh,
@@ -48,7 +49,7 @@ def refine_garment(garment: Garment, longest: float) -> Garment:
         offset=jnp.sum(share * garment.offset[at], axis=1),
         skin=skin / jnp.sum(skin, axis=1, keepdims=True),
         polygons=None,
-        coarse_faces=garment.mesh.faces,
+        coarse_faces=garment.mesh.faces if own is None else own,
     )
 
 

@@ -197,8 +197,8 @@ def nearest_index(squared: Float[Array, " rows *others"]) -> Int[Array, " *other
     """Index along the first axis of the smallest value, among values that are not negative.
 
     Several times faster than `fast_argmin`: the index takes the place of the last bits of
-    the values, so that a minimum suffices. Values that differ by less than the number of
-    rows over 2^23 of their size count as equal; of those, any may be chosen.
+    the values, so that a minimum suffices. Values that differ by less than twice the
+    number of rows over 2^23 of their size count as equal; the first of those is chosen.
 
     Args:
         squared: Values of at least 0, as squared distances.

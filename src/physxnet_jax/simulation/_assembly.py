@@ -23,7 +23,7 @@ class Assembly:
         mass: Vertex masses [kg], shape [vertices].
         pinned: Vertices that follow the skin, shape [vertices].
         weights: Skinning weights of cloth vertices, shape [vertices, joints].
-        thickness: Gap kept to the skin [m], shape [vertices].
+        thickness: Smallest gap kept to the skin [m], shape [vertices].
         friction: Coulomb coefficient [1], shape [vertices].
         stretch: Membrane stiffness of faces [N/m], shape [faces].
         bend: Bending stiffness of faces [N m], shape [faces].

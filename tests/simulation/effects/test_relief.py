@@ -1,9 +1,11 @@
 """Relief of the skin: spheres and tips, whose rise over flat triangles is known."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
-from physxnet_jax.garment import template
+from physxnet_jax.garment import refine_garment, template
 from physxnet_jax.simulation import Scene, prepare_scene
 from physxnet_jax.simulation.effects import BodyContact
 from physxnet_jax.simulation.effects._relief import relief
@@ -55,3 +57,17 @@ def test_small_triangles_lie_lower_than_large_ones():
         (contact,) = prepare_scene(scene).effects
         heights.append(float(np.mean(contact.relief)))
     assert 0 < heights[1] < heights[0] < 0.004
+
+
+def test_each_garment_of_a_scene_has_the_relief_of_its_own_triangles():
+    coarse, fine = template("dress"), refine_garment(template("bottom"), 0.012)
+    plain = dataclasses.replace(fine, coarse_faces=None)
+    effects = (BodyContact(),)
+    (alone,) = prepare_scene(Scene((coarse,), effects)).effects
+    (both,) = prepare_scene(Scene((plain, coarse), effects)).effects
+    (refined,) = prepare_scene(Scene((fine, coarse), effects)).effects
+    means = [[float(np.mean(c.relief[:, k])) for k in range(2)] for c in (both, refined)]
+    assert means[0][1] == pytest.approx(float(np.mean(alone.relief)), rel=0.3)
+    assert means[0][0] < 0.6 * means[0][1], "short edges"
+    assert means[1][0] > 1.5 * means[0][0], "the triangles that come back are the coarse ones"
+    assert set(np.unique(both.part)) == {0, 1} and len(both.part) >= fine.num_vertices

@@ -1,11 +1,16 @@
 """Every hard case of `physxnet stress`, one test each, and controls that bounds can fail."""
 
+import dataclasses
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physxnet_jax.evaluation import CASES, Finding, run_case
+from physxnet_jax.evaluation import CASES, PEER_CASES, Finding, run_case, surface_faults
 from physxnet_jax.evaluation._stress_worn import run_own
 from physxnet_jax.garment import Fabric, square_sheet
+from physxnet_jax.geometry import vertex_normals
+from physxnet_jax.motion import animate
 from physxnet_jax.simulation import (
     STANDARD,
     Effect,
@@ -15,7 +20,7 @@ from physxnet_jax.simulation import (
     settle_on_static_body,
     standard_effects,
 )
-from physxnet_jax.simulation.effects import BodyContact, LayerContact, Stretch
+from physxnet_jax.simulation.effects import BodyContact, LayerContact, Pin, Stretch
 
 release = pytest.mark.release
 
@@ -69,6 +74,26 @@ def test_hard_clothes_break_their_bound_without_the_guard(name, effects, quantit
     _, rows = run_own(name, effects)
     broken = [what for what, bound, measured in rows if not measured <= bound]
     assert any(quantity in what for what in broken), broken
+
+
+@pytest.mark.release
+def test_visible_skin_looks_through_a_lining():
+    """The lined top sunk into the body: its lining faces the skin with its outer side."""
+    case = PEER_CASES["a_lined_top"]
+    garments, motion = case.garments(), case.motion()
+    still = dataclasses.replace(motion, rotations=motion.rotations[:1], root=motion.root[:1])
+    assembly = prepare_scene(Scene(garments, (Pin(),))).assembly
+    rest, weights = (jnp.asarray(x, jnp.float32) for x in (assembly.rest, assembly.weights))
+    body_rest = jnp.asarray(assembly.rest_body, jnp.float32)
+    normals = vertex_normals(rest, jnp.asarray(assembly.faces))
+    half = len(rest) // 2
+    # Normals of the lining face the skin.
+    outwards = jnp.concatenate([-normals[:half], normals[half:]])
+    shares = []
+    for depth in (0.0, 0.03):
+        x = animate(assembly.body, body_rest, rest - depth * outwards, weights, still)
+        shares.append(surface_faults(assembly, still, np.asarray(x)).visible_skin)
+    assert shares[0] < 0.01 < 0.05 < shares[1], shares
 
 
 def test_findings_fail_above_the_bound_and_for_nan():

@@ -29,7 +29,7 @@ from ._search_start import patch_centres, sleeve_labels, starting_vertices
 
 @dataclasses.dataclass(frozen=True)
 class BodyContact(Effect):
-    """Keeps cloth at its thickness from the skin, with Coulomb friction.
+    """Keeps cloth at least its thickness from the skin, with Coulomb friction.
 
     Once per contact interval, each cloth vertex finds its closest skin point. During the
     interval the point and its normal move with the skin and bound a half-space that the
@@ -45,7 +45,7 @@ class BodyContact(Effect):
 
     Edges and faces of the cloth larger than ``sample_spacing`` are kept off the skin at sample
     points as well, so that no skin comes through a large triangle. Over features of the skin
-    smaller than a triangle the corners lie as high as they are.
+    smaller than a triangle the corners lie at least as high as they are.
 
     Attributes:
         sample_spacing: Largest distance between points of the cloth that feel contact [m].
@@ -80,10 +80,12 @@ class BodyContact(Effect):
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Builds patches around skin vertices and the first skin vertex of each search."""
-        reach = _RELIEF_REACH * min(_edge_length(assembly), self.sample_spacing)
+        reaches = [_RELIEF_REACH * min(n, self.sample_spacing) for n in _edge_lengths(assembly)]
         faces = np.concatenate([assembly.faces, assembly.coarse_faces])
         samples = sample_faces(assembly.rest, faces, self.sample_spacing)
         free = np.asarray(inverse_mass) > 0
+        part = np.searchsorted(assembly.parts, np.arange(len(assembly.rest)), side="right") - 1
+        part = np.concatenate([part, part[np.asarray(samples.corners[0])]])
         assembly = with_samples(assembly, samples)
         body = assembly.body
         skin = assembly.rest_body[:NUM_BODY_VERTICES]
@@ -113,7 +115,8 @@ class BodyContact(Effect):
         return _Contact(
             samples,
             skinned_points,
-            float32(relief(skin, np.asarray(normals), reach)[used, None]),
+            float32(np.stack([relief(skin, np.asarray(normals), r)[used] for r in reaches], 1)),
+            jnp.asarray(part.astype(np.int32)),
             jnp.asarray(ring.reshape(len(used), -1).T.astype(np.int32)),
             jnp.asarray(near.T.astype(np.int32)),
             jnp.asarray(np.moveaxis(local[faces[kept]][near], 0, 2)),
@@ -149,11 +152,17 @@ _CLEARANCE = 0.002
 _RELIEF_REACH = 0.6
 
 
-def _edge_length(assembly: Assembly) -> float:
-    """Length of long edges at rest [m]."""
-    ends = mesh_edges(assembly.faces).vertices
-    length = np.linalg.norm(assembly.rest[ends[:, 0]] - assembly.rest[ends[:, 1]], axis=1)
-    return float(np.quantile(length, 0.9))
+def _edge_lengths(assembly: Assembly) -> list[float]:
+    """Length of long edges of each garment, or of the mesh that it refines, at rest [m]."""
+    out = []
+    for i, j in zip(assembly.parts, assembly.parts[1:]):
+        own, coarse = (
+            f[((f >= i) & (f < j)).all(axis=1)] for f in (assembly.faces, assembly.coarse_faces)
+        )
+        ends = mesh_edges(coarse if len(coarse) else own).vertices
+        length = np.linalg.norm(assembly.rest[ends[:, 0]] - assembly.rest[ends[:, 1]], axis=1)
+        out.append(float(np.quantile(length, 0.9)) if len(length) else 0.0)
+    return out
 
 
 @pytree
@@ -221,7 +230,8 @@ class _Contact(Prepared):
     unilateral = True
     samples: Samples
     skin: SkinnedPoints
-    relief: Float[Array, "skin 1"]
+    relief: Float[Array, "skin garments"]
+    part: Int[Array, " points"]
     ring: Int[Array, "ring skin"]
     table: Int[Array, "patch skin"]
     corners: Int[Array, "patch 3 skin"]
@@ -324,7 +334,7 @@ class _Contact(Prepared):
         far = jnp.sum(from_centre**2, axis=1) > self.radius[last] ** 2
         unit = n0 / jnp.sqrt(jnp.sum(n0 * n0, axis=1, keepdims=True) + 1e-12)
         later = self.pinch.room(end)
-        over = self._at(self.relief, face, weights) + _CLEARANCE
+        over = self._at(self.relief, face, weights, self.part[:, None]) + _CLEARANCE
         margin = jnp.maximum(self.thickness[..., None], over)
         wanted, top = self._height_bounds(self._at(room, face, weights), margin)
         rise, fall = self._height_bounds(self._at(later, face, weights), margin)
@@ -342,9 +352,11 @@ class _Contact(Prepared):
         )
         return _Touch(own, beside, centre, later, margin, far, unit, ceiling)
 
-    def _at(self, values: Array, face: Array, weights: Array) -> Float[Array, "points 1 batch"]:
-        """Values of skin vertices at points of faces."""
-        lane = jnp.arange(values.shape[1])[None]
+    def _at(
+        self, values: Array, face: Array, weights: Array, lane: Array | None = None
+    ) -> Float[Array, "points 1 batch"]:
+        """Values of skin vertices at points of faces; of the columns ``lane``, or the batch's."""
+        lane = jnp.arange(values.shape[1])[None] if lane is None else lane
         tri = self.faces[face]
         parts = [weights[k] * values[tri[..., k], lane] for k in range(3)]
         return jnp.sum(jnp.stack(parts), axis=0)[:, None]

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-# Higher rises are limbs and folds, not features of the skin [m].
+# Largest relief: fingers and toes aren't covered by single triangles [m].
 _MAX_RELIEF = 0.010
 # Neighbours farther than this share of the reach stand for a triangle's corners.
 _RING = 0.6
