@@ -65,7 +65,7 @@ def test_refined_garments_return_on_their_own_vertices_without_skin_through_them
         own = prepare_scene(Scene((tunic,))).assembly
         faults = surface_faults(own, motion, x[:, : tunic.num_vertices], frames=looked)
         shares.append(faults.visible_skin)
-    assert shares[0] < 2e-3 < 1e-2 < shares[1], shares
+    assert shares[0] < 2e-3 < 5e-3 < shares[1], shares
 
 
 @pytest.mark.release

@@ -44,7 +44,7 @@ def test_moves_of_all_samples_by_one_vector_move_the_vertices_by_no_more():
 
 @pytest.mark.release
 def test_skin_does_not_show_through_large_triangles(data_dir):
-    garment, _ = load_garment(data_dir / "garments" / "pants.obj")
+    garment, _ = load_garment(data_dir / "garments" / "helper_tights.obj")
     motion = load_motion("punch", fps=30.0)
     motion = dataclasses.replace(motion, rotations=motion.rotations[:20], root=motion.root[:20])
     shares = []
@@ -59,4 +59,4 @@ def test_skin_does_not_show_through_large_triangles(data_dir):
             scene.assembly, motion, out.positions[0], frames=np.array([0, 10, 19])
         )
         shares.append(seen.visible_skin)
-    assert shares[0] < 1e-3 < shares[1]
+    assert shares[0] < 3e-4 < 1.5e-3 < shares[1], shares
