@@ -1,6 +1,7 @@
 """Stress tests with clothes that are hard by their make or by what they are worn over."""
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from ..body import load_body
 from ..garment import Garment, carried, subdivide, template
 from ..geometry import boundary_loops, make_mesh, vertex_normals
 from ..motion import Motion, load_motion
-from ._stress import case
+from ._stress import CASES
 from ._stress_worn import (
     FALLEN,
     LAST_INSIDE,
@@ -114,7 +115,7 @@ _BOUNDS = {
     VISIBLE_SKIN: 0.1,
 }
 
-PEER_CASES |= {
+_CLOTHES = {
     "edges_of_ten_centimetres": PeerCase(_tunic, lambda: _clip("spin", 40), _BOUNDS),
     "fifty_thousand_vertices": PeerCase(_fine_dress, lambda: _clip("punch", 6), _BOUNDS),
     "a_lined_top": PeerCase(_lined_top, lambda: _clip("punch", 40), _BOUNDS | {LAST_INSIDE: 1.0}),
@@ -125,35 +126,11 @@ PEER_CASES |= {
         _top_over_trousers, lambda: _clip("side step", 60), _BOUNDS | {VISIBLE_INNER: 0.1}
     ),
 }
+PEER_CASES |= _CLOTHES
 
 
-@case
-def edges_of_ten_centimetres() -> Iterator[tuple[str, float, float]]:
-    """Between vertices of a coarse tube the body would come through."""
-    yield from run_own("edges_of_ten_centimetres")[1]
+def _rows(name: str) -> Iterator[tuple[str, float, float]]:
+    yield from run_own(name)[1]
 
 
-@case
-def fifty_thousand_vertices() -> Iterator[tuple[str, float, float]]:
-    yield from run_own("fifty_thousand_vertices")[1]
-
-
-@case
-def a_lined_top() -> Iterator[tuple[str, float, float]]:
-    """Two shells, sewn together: the inner one faces the skin with its outer side."""
-    yield from run_own("a_lined_top")[1]
-
-
-@case
-def a_cape_on_a_body_that_touches_itself() -> Iterator[tuple[str, float, float]]:
-    yield from run_own("a_cape_on_a_body_that_touches_itself")[1]
-
-
-@case
-def sleeves_on_crossed_arms() -> Iterator[tuple[str, float, float]]:
-    yield from run_own("sleeves_on_crossed_arms")[1]
-
-
-@case
-def a_top_over_trousers() -> Iterator[tuple[str, float, float]]:
-    yield from run_own("a_top_over_trousers")[1]
+CASES |= {name: functools.partial(_rows, name) for name in _CLOTHES}

@@ -345,7 +345,7 @@ class _Contact(Prepared):
         heights = wanted, rise - wanted, top, fall - top
         surface = _Surface(p0 - base, p1 - p0, n0, n1 - n0, *heights)
         vertices = len(base) - self.samples.count
-        # Apart already here: XLA would cut them in each substep.
+        # In two parts, because samples are pushed after the vertices.
         own, beside = (
             jax.lax.optimization_barrier(jax.tree.map(lambda x, rows=rows: x[rows], surface))
             for rows in (slice(vertices), slice(vertices, None))
