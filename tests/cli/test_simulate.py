@@ -68,7 +68,13 @@ def test_only_frames_can_override_a_scene_file(tmp_path, capsys):
     out = tmp_path / "a.npz"
     assert main(["simulate", str(scene), "--frames", "2", "-o", str(out), "--quiet"]) == 0
     with np.load(out) as data:
-        assert data["bottom_positions"].shape[0] == 2
+        plain = data["bottom_positions"]
+        assert plain.shape[0] == 2
+    words = ["simulate", str(scene), "--frames", "2", "--refine", "0.02", "-o", str(out), "--quiet"]
+    assert main(words) == 0
+    with np.load(out) as data:
+        assert data["bottom_positions"].shape == plain.shape
+        assert np.abs(data["bottom_positions"] - plain).max() > 1e-3, "refined"
     assert main(["simulate", str(scene), "--frames", "0"]) == 2
     assert "at least one" in capsys.readouterr().err
     for words in (["--wear", "dress"], ["--fps", "25"], ["--wind", "0", "0", "1"]):

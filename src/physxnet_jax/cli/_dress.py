@@ -137,7 +137,7 @@ def scene_file(command: Simulate | Effects) -> Any:
     """
     source = dataclasses.replace(command.source, frames=MotionSource().frames)
     given = [*changed(source), *changed(command.outfit), *changed(command.simulation)]
-    given = [g for g in given if g not in ("--accuracy", "--engine")]
+    given = [g for g in given if g not in ("--accuracy", "--engine", "--refine")]
     if isinstance(command, Simulate):
         given += changed(command.person)
     if given:
