@@ -79,7 +79,7 @@ def main() -> None:
     with Progress() as bars:
         bar = bars.add_task("simulations", total=len(names) * len(TEMPLATES))
         for t in TEMPLATES:
-            scene = Scene((template(t),), standard_effects(1), body)
+            scene = Scene((template(t),), standard_effects((template(t),)), body)
             for name in names:
                 rollout, ms = simulated(name, scene, motion)
                 cloth[name][t] = np.asarray(rollout.positions[0])

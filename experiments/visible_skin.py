@@ -59,9 +59,7 @@ def measure(garment: str, action: str, sampled: bool, data: pathlib.Path) -> Row
     paths = [n if n in TEMPLATES else data / "garments" / f"{n}.obj" for n in names]
     worn = tuple(px.load_garment(path)[0] for path in paths)
     contact = BodyContact() if sampled else BodyContact(sample_spacing=NO_SAMPLES)
-    effects = tuple(
-        contact if isinstance(e, BodyContact) else e for e in standard_effects(len(worn))
-    )
+    effects = tuple(contact if isinstance(e, BodyContact) else e for e in standard_effects(worn))
     scene, motion = prepare_scene(Scene(worn, effects)), clip(action, data)
     (out,) = simulate_batch(scene, [motion], solver=PRESETS["standard"])
     frames = np.arange(0, motion.num_frames, STRIDE)

@@ -233,3 +233,9 @@ def test_reproduction_page_matches_the_measurements():
             assert found is not None
             assert round(found["rmse_vertices_mm"], 2) == line["rmse_vertices_mm"]
         assert card["licence"] and card["acknowledgement"]
+
+
+def test_kinds_of_the_tailor_are_those_of_the_page():
+    text = (ROOT / "docs/garments.md").read_text()
+    part = text.partition("<!-- begin tailor -->\n")[2].partition("<!-- end tailor -->")[0]
+    assert part == runpy.run_path(str(ROOT / "experiments/build_tailor.py"))["kinds_table"]()

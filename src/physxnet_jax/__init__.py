@@ -50,6 +50,7 @@ if _TYPE_CHECKING:
         Fabric as Fabric,
         Garment as Garment,
         load_garment as load_garment,
+        tailor as tailor,
         template as template,
     )
     from .io import write_clip as write_clip
@@ -102,6 +103,7 @@ _PACKAGES = {
         "Fabric",
         "Garment",
         "load_garment",
+        "tailor",
         "template",
     ),
     "io": ("write_clip",),

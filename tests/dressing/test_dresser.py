@@ -189,7 +189,7 @@ def test_unknown_platforms_are_refused_with_the_known_ones(dresser, tmp_path):
 
 
 def test_garments_without_a_decoder_are_refused():
-    with pytest.raises(PhysXNetError, match="one of top, bottom, dress"):
+    with pytest.raises(PhysXNetError, match="one of tee, shirt"):
         make_dresser(["cape"])
 
 

@@ -152,7 +152,7 @@ def test_check_detects_explosions_wrong_counts_and_stretched_cloth():
     assert all(f.holds for f in fine if "inside" not in f.quantity), "skinning is calm cloth"
     far = sequence(offset=(0.0, 0.9, 0.0))
     wrong = {f.quantity for f in check_sequence(far, 25) if not f.holds}
-    assert {"frames missing", "largest offset, m"} <= wrong
+    assert {"frames missing", "slid along the body, m"} <= wrong
     short = sequence()
     short.offsets["bottom"] = short.offsets["bottom"][:-2]
     wrong = {f.quantity for f in check_sequence(short) if not f.holds}

@@ -28,11 +28,35 @@ def test_words_are_parsed(word, expected):
         ("top:colour=red", "there are as, fabric"),
         ("a.obj:as=hat", "one of top, bottom, dress"),
         ("top:fabric=tin", "one of cotton"),
+        ("top:ease=0.1", "there are as, fabric"),
+        ("tee:as=top", "there are fabric, hold, ease"),
+        ("tee:ease=wide", "expected metres, as in ease=0.1"),
     ],
 )
 def test_unknown_options_are_refused(word, fix):
     with pytest.raises(PhysXNetError, match=fix):
         parse_wear(word)
+
+
+def test_measures_of_tailored_garments_are_parsed_and_written():
+    item = parse_wear("skirt:length=0.5,hold=waist+hem,fabric=denim")
+    assert item.measures == {"length": 0.5} and item.hold == ("waist", "hem")
+    assert item.word("skirt") == "skirt:length=0.5,hold=waist+hem"
+    again = parse_wear(item.word(item.name))
+    assert (again.measures, again.hold, again.fabric) == (item.measures, item.hold, None)
+    assert parse_wear("skirt").hold == () and parse_wear("skirt").measures == {}
+    assert parse_wear("coat.obj:as=top").word("/a/coat.obj") == "/a/coat.obj:as=top"
+
+
+def test_tailored_garments_are_loaded_by_name(body):
+    garment, report = load_garment("shorts:ease=0.12,fabric=denim")
+    assert (garment.name, garment.template, report.warning) == ("shorts", "bottom", None)
+    assert garment.fabric.density == FABRICS["denim"].density
+    broad = body.shape(weight_up=1.0)
+    wide, _ = load_garment("shorts", shape=broad)
+    usual, _ = load_garment("shorts")
+    rest = body.rest_vertices(broad)
+    assert abs(wide.rest_vertices(rest) - usual.rest_vertices(rest)).max() > 0.005
 
 
 def test_the_default_fabric_applies_where_none_is_named():

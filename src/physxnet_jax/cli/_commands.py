@@ -168,6 +168,27 @@ class ExportRest:
 
 
 @dataclasses.dataclass(frozen=True)
+class Tailor:
+    """Cut a garment to measure and write it at rest, for other programs.
+
+    The mesh has its pattern in metres as texture coordinates; measures, fabric and held vertices
+    stand in a .json file beside it. `physxnet clips` lists the kinds.
+
+    Examples:
+      physxnet tailor tee:ease=0.12,length=0.55 -o tee.obj
+      physxnet tailor skirt:flare=0.6,fabric=denim -o skirt.glb --shape weight_up=0.5
+    """
+
+    garment: Annotated[str, tyro.conf.Positional]
+    """Kind and measures [m]: tee:ease=0.12,length=0.55."""
+    out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
+    """The file: .obj, .glb, .usd, .usdc or .usda."""
+    shape: tuple[str, ...] = ()
+    """Shape parameters of the person, as name=value: gender=1 weight_up=0.5 …"""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
+
+
+@dataclasses.dataclass(frozen=True)
 class Demo:
     """Dress a built-in walk: writes demo.usdc, demo.mp4 and demo.png.
 

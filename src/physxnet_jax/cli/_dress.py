@@ -25,7 +25,15 @@ from ..motion import Motion, load_motion
 from ..viewer import check_preview, render_preview
 from ._calibrate import choose
 from ._commands import Demo, Dress, Effects, Simulate
-from ._options import BodyOptions, MotionSource, Outfit, changed, check_body, check_simulates
+from ._options import (
+    BodyOptions,
+    MotionSource,
+    Outfit,
+    Output,
+    changed,
+    check_body,
+    check_simulates,
+)
 from ._progress import UNWRITTEN, print_json, progress_bars
 from ._shape import parse_shape
 from ._table import closing_table, report, rollout_report, rollout_table
@@ -71,13 +79,13 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
     if command.terminal.json:
         choice = {} if selected is None else {"picked": selected.summary}
         print_json(report(clip) | choice | {"files": written})
-        return 0
+        return _code(output, clip)
     for table in closing_table(clip):
         console.print(table)
     if selected is not None:
         console.print(selected.summary, highlight=False)
     _print_end(clip, (), written, console)
-    return 0
+    return _code(output, clip)
 
 
 def run_simulate(command: Simulate, console: Console) -> int:
@@ -101,11 +109,16 @@ def run_simulate(command: Simulate, console: Console) -> int:
         clip, written, seconds = _run(job, output, pictures, progress)
     if command.terminal.json:
         files = {"notes": [*job.notes, *clip.notes], "files": written}
-        print_json(rollout_report(clip, job.simulation, seconds) | files)
-        return 0
+        print_json(rollout_report(clip, seconds) | files)
+        return _code(output, clip)
     console.print(rollout_table(clip, job.simulation, seconds))
     _print_end(clip, job.notes, written, console)
-    return 0
+    return _code(output, clip)
+
+
+def _code(output: Output, clip: DressedClip) -> int:
+    """Exit code: 1 for a garment that came off, if that matters."""
+    return int(output.strict and clip.came_off)
 
 
 def run_demo(command: Demo, console: Console) -> int:

@@ -23,6 +23,7 @@ from ._commands import (
     Fit,
     Inspect,
     Simulate,
+    Tailor,
     View,
 )
 from ._experiment_commands import Bench, Dataset, Evaluate, Stress, Train
@@ -46,6 +47,7 @@ _COMMANDS: dict[str, _Handler] = {
     "export": _Handler(Export, "_export", "export", _ANIMATE),
     "inspect": _Handler(Inspect, "_garments", "inspect", _GARMENTS),
     "fit": _Handler(Fit, "_garments", "fit", _GARMENTS),
+    "tailor": _Handler(Tailor, "_tailor", "run_tailor", _GARMENTS),
     "export-rest": _Handler(ExportRest, "_garments", "export_rest", _GARMENTS),
     "simulate": _Handler(Simulate, "_dress", "run_simulate", _SIMULATE),
     "effects": _Handler(Effects, "_effects", "price", _SIMULATE),
@@ -68,8 +70,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     Returns:
         0 for success; 1 for a broken installation, or if `inspect`, `fit`, `stress`,
-        `dataset check` or `doctor` finds a problem; 2 for an error in the input; 130 if
-        interrupted by Ctrl-C; 141 if the reader of the output closed the pipe.
+        `dataset check`, `doctor` or ``--strict`` finds a problem; 2 for an error in the input;
+        130 if interrupted by Ctrl-C; 141 if the reader of the output closed the pipe.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):

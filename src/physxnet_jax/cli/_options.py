@@ -90,9 +90,10 @@ class Outfit:
     """Outfit."""
 
     wear: tuple[str, ...] = ("top", "bottom")
-    """Templates (top, bottom, dress) and files (.obj, .glb, .gltf, .usd*, .ply, .stl), with
-    options after a colon: coat.obj:as=top,fabric=wool. Tops go over dresses, dresses over
-    trousers; among garments of one type, later ones are outer."""
+    """Tailored garments (tee, shirt, trousers, skirt, aline and others, see `physxnet clips`),
+    templates (top, bottom, dress) and files (.obj, .glb, .gltf, .usd*, .ply, .stl), with options
+    after a colon: tee:ease=0.12,length=0.5 or coat.obj:as=top,fabric=wool. Tops go over dresses
+    and skirts, these over trousers; among garments of one type, later ones are outer."""
     fabric: Fabric | None = None
     """Fabric of all garments that don't name one."""
 
@@ -130,6 +131,8 @@ class Output:
     """Image or video: .png, .gif or .mp4."""
     body: bool = True
     """Include the body in the result."""
+    strict: bool = False
+    """Exit with code 1 if a simulated garment slides off the body."""
 
 
 @dataclasses.dataclass(frozen=True)

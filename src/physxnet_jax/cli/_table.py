@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from ..dressing import DressedClip, Simulation, acting_effects
+from ..dressing import DressedClip, Simulation
 from ..simulation import Status
 
 
@@ -94,7 +94,7 @@ _DIAGNOSTICS = {
 }
 
 
-def rollout_report(clip: DressedClip, simulation: Simulation, seconds: float) -> dict[str, Any]:
+def rollout_report(clip: DressedClip, seconds: float) -> dict[str, Any]:
     """A simulation's diagnostics for JSON."""
     rollout = clip.rollout
     assert rollout is not None
@@ -103,7 +103,7 @@ def rollout_report(clip: DressedClip, simulation: Simulation, seconds: float) ->
         "frames": clip.num_frames,
         "fps": clip.fps,
         "seconds": seconds,
-        "effects": list(acting_effects(simulation, len(clip.garments))),
+        "effects": list(clip.effects),
         "worst": rollout.worst,
         "frames_marked": {k: n for k, n in marked.items() if n},
     }
@@ -113,8 +113,7 @@ def rollout_table(clip: DressedClip, simulation: Simulation, seconds: float) -> 
     """A simulation's diagnostics over all frames."""
     rollout = clip.rollout
     assert rollout is not None
-    acting = acting_effects(simulation, len(clip.garments))
-    named = ", ".join(acting) or f"forces and contact of {simulation.engine}"
+    named = ", ".join(clip.effects) or f"forces and contact of {simulation.engine}"
     table = Table(
         title=f"{clip.num_frames} frames in {seconds:.1f} s; {named}", title_justify="left"
     )

@@ -14,6 +14,7 @@ from ..errors import FormatError
 from ..garment import Garment
 from ..geometry import polar_rotation
 from ..motion import clip_transforms
+from ..simulation import OFF
 from ._store import QUANTIZATION_STEP, Sequence
 
 # Largest usable offsets from skinning [m]. Beyond the first, a sleeve or trouser leg is off its
@@ -66,7 +67,9 @@ class Frames:
 def usable_garment(meta: dict) -> bool:
     """Whether a simulated garment stayed on the body."""
     # Penetration isn't measured for a network's predictions, which can't come off.
-    return bool(meta["finite"]) and meta["worst"].get("penetration_max", 0.0) <= MAX_PENETRATION
+    worst = meta["worst"]
+    inside = worst.get("penetration_max", 0.0) <= MAX_PENETRATION
+    return bool(meta["finite"]) and inside and worst.get("slipped", 0.0) <= OFF
 
 
 def is_trainable(sequence: Sequence, name: str) -> bool:

@@ -36,6 +36,5 @@ from ._scene_file import (
 from ._simulate import (
     EXTERNAL_ENGINES as EXTERNAL_ENGINES,
     Simulation as Simulation,
-    acting_effects as acting_effects,
     run_simulation as run_simulation,
 )

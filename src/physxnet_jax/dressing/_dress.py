@@ -15,7 +15,7 @@ from ..garment import Garment
 from ..io import AnimatedMesh
 from ..models import BoundGarment, Predictor, load_predictor
 from ..motion import BLOCK, Motion, prepare_motion, slice_motion, sudden_turns
-from ..simulation import Rollout
+from ..simulation import Rollout, Status
 from ._blocks import Block, PosedClip, infer_clip, inside_shares, pose_clip
 from ._character import (
     Character,
@@ -26,7 +26,7 @@ from ._character import (
 from ._dresser import Dresser, dress_garments, move_to_body
 from ._inference import Inference
 from ._meshes import Wear, animated_meshes, resolve_garments
-from ._simulate import Simulation, build_scene, run_simulation
+from ._simulate import EXTERNAL_ENGINES, Simulation, build_scene, run_simulation
 from ._stages import Stage, timed
 from .postprocess import make_colliders
 
@@ -56,6 +56,8 @@ class DressedClip:
         worst: For each garment, the frame with the largest share inside the body, and that
             share; empty for a `Character`.
         rollout: The simulation with its diagnostics; None for other methods.
+        effects: Names of the effects that acted in the simulation; those of an external engine
+            aren't listed.
     """
 
     meshes: tuple[AnimatedMesh, ...]
@@ -69,11 +71,17 @@ class DressedClip:
     notes: tuple[str, ...] = ()
     worst: dict[str, tuple[int, float]] = dataclasses.field(default_factory=dict)
     rollout: Rollout | None = None
+    effects: tuple[str, ...] = ()
 
     @property
     def garments(self) -> tuple[AnimatedMesh, ...]:
         """The garments alone."""
         return tuple(m for m in self.meshes if m.name != "body")
+
+    @property
+    def came_off(self) -> bool:
+        """Whether a simulated garment slid off the body in some frame."""
+        return self.rollout is not None and bool((self.rollout.status & int(Status.OFF)).any())
 
     @property
     def num_frames(self) -> int:
@@ -160,6 +168,7 @@ class _Cloth:
     raw: dict[str, np.ndarray]
     positions: dict[str, np.ndarray]
     rollout: Rollout | None = None
+    effects: tuple[str, ...] = ()
 
 
 def _check_options(method: str, motion: Any, body: Any, shape: Any, start: float) -> None:
@@ -199,7 +208,12 @@ def _load_garments(
     character = person.character
     with timed(stages, "garments"):
         # Garments are modelled on the built-in body, then transferred to the character.
-        garments, notes = resolve_garments(wear, person.body if character is None else load_body())
+        built_in = character is not None
+        garments, notes = resolve_garments(
+            wear,
+            load_body() if built_in else person.body,
+            None if built_in else person.shape,
+        )
         if character is not None:
             return [bind_to_character(g, character) for g in garments], notes
         return [move_to_body(person.body, g) for g in garments], notes
@@ -239,7 +253,9 @@ def _simulate_cloth(
     )
     named = dict(zip([g.name for g in scene.garments], rollout.positions, strict=True))
     cloth = {g.name: named[g.name] for g in garments}
-    return _Cloth(raw=cloth, positions=cloth, rollout=rollout)
+    own = simulation.engine not in EXTERNAL_ENGINES
+    effects = tuple(type(e).__name__ for e in scene.effects) if own else ()
+    return _Cloth(raw=cloth, positions=cloth, rollout=rollout, effects=effects)
 
 
 def _infer_cloth(
@@ -317,8 +333,22 @@ def _assemble_clip(
         notes=(
             *(() if fault is None else (fault,)),
             *(() if character is None else character.notes),
+            *_slide_note(cloth.rollout),
             *notes,
         ),
         worst=worst,
         rollout=cloth.rollout,
+        effects=cloth.effects,
+    )
+
+
+def _slide_note(rollout: Rollout | None) -> tuple[str, ...]:
+    """A warning if a garment slid off in a simulation."""
+    off = np.zeros(0) if rollout is None else rollout.status & int(Status.OFF)
+    if rollout is None or not off.any():
+        return ()
+    far, first = rollout.diagnostics["slipped"].max(), int(np.argmax(off > 0))
+    return (
+        f"a garment comes off: from frame {first} on its waist, upper border or neckline slides up"
+        f" to {100 * far:.0f} cm along the body; {Status.OFF.advice}",
     )

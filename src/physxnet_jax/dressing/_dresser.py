@@ -112,7 +112,7 @@ def make_dresser(
         True
     """
     body = load_body() if body is None else body
-    garments, notes = resolve_garments(wear, body)
+    garments, notes = resolve_garments(wear, body, shape)
     return dress_garments(
         [move_to_body(body, g) for g in garments],
         notes,

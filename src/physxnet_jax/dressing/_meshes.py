@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from jaxtyping import Array, Float
 
 from ..body import Body
 from ..errors import PhysXNetError
@@ -14,7 +15,7 @@ from ..io import AnimatedMesh
 from ..motion import Motion, body_animation
 
 Wear = Sequence[Garment | str | pathlib.Path] | Garment | str | pathlib.Path
-"""One or several garments, garment files or template names.
+"""One or several garments, garment files, kinds of the tailor or templates.
 
 Names take options after a colon, see `parse_wear`.
 """
@@ -65,12 +66,15 @@ def animated_meshes(
     return tuple(meshes)
 
 
-def resolve_garments(wear: Wear, body: Body) -> tuple[list[Garment], tuple[str, ...]]:
+def resolve_garments(
+    wear: Wear, body: Body, shape: Float[Array, " shapes"] | None = None
+) -> tuple[list[Garment], tuple[str, ...]]:
     """Loads garments, makes their names unique and collects warnings about their files.
 
     Args:
-        wear: One or several garments, garment files or template names.
+        wear: One or several garments, garment files, kinds of the tailor or templates.
         body: The body that garment files are modelled on.
+        shape: Shape parameters of the person, for whom tailored garments are cut.
 
     Raises:
         PhysXNetError: A file can't be read or worn, or there is no garment.
@@ -83,7 +87,7 @@ def resolve_garments(wear: Wear, body: Body) -> tuple[list[Garment], tuple[str, 
         if isinstance(word, Garment):
             garment = word
         else:
-            garment, found = load_garment(word, body=body)
+            garment, found = load_garment(word, body=body, shape=shape)
             if found.warning is not None:
                 notes.append(found.warning)
         name, count = garment.name, 2

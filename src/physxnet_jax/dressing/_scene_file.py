@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ..body import load_body
 from ..errors import FormatError
 from ..files import atomic_write, is_file
-from ..garment import FABRICS, Garment, parse_wear, with_fabric
+from ..garment import FABRICS, Garment, parse_wear, with_default_fabric, with_fabric
 from ..io import split_part
 from ..motion import Motion, prepare_motion, sudden_turns
 from ..simulation import EFFECTS, PRESETS, Accuracy, Effect, Scene
@@ -109,7 +109,7 @@ def _scene_keys(
     garments = []
     for w in words:
         item = parse_wear(w)
-        file = absolute(item.name) + (f":as={item.template}" if item.template else "")
+        file = item.word(absolute(item.name))
         garments.append({"file": file} | ({"fabric": item.fabric} if item.fabric else {}))
     keys = {"motion": absolute(motion), "garments": garments}
     for name, value in options.items():
@@ -136,7 +136,7 @@ def make_scene(
 
     Args:
         motion: A motion, a motion file, or the name of a built-in clip.
-        wear: Garments, garment files or template names; sorted into layer order.
+        wear: Garments, garment files, kinds or templates; sorted into layer order.
         simulation: Accuracy and effects; its other options belong to `run_simulation`.
         also: Additional effects; each replaces an effect of the same type.
         fps: Frames per second; by default that of a `Motion`, else 30.
@@ -163,7 +163,7 @@ def make_scene(
         skeleton=skeleton,
         joint_map=joint_map,
     )
-    garments, notes = resolve_garments(wear, body)
+    garments, notes = resolve_garments(wear, body, shape)
     scene = build_scene(garments, body, shape, simulation, also)
     fault = sudden_turns(body, clip)
     options = {
@@ -215,7 +215,9 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
     """
     path = pathlib.Path(path)
     text, words = _read_scene(path)
-    worn, notes = resolve_garments([_resolve_path(path, g["file"]) for g in words], load_body())
+    shape = load_body().shape(**text["shape"]) if "shape" in text else None
+    places = [_resolve_path(path, g["file"]) for g in words]
+    worn, notes = resolve_garments(places, load_body(), shape)
     garments = [
         with_fabric(w, g["fabric"]) if "fabric" in g else w
         for w, g in zip(worn, words, strict=True)
@@ -233,12 +235,12 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
             accuracy=text.get("accuracy", "standard"),
             effects=tuple(_parse_effects(path, text["effects"])) if "effects" in text else None,
         ),
-        shape=load_body().shape(**text["shape"]) if "shape" in text else None,
+        shape=shape,
         also=_parse_effects(path, text.get("also", {})),
     )
     files = [
-        f"{_resolve_path(path, g['file'])}" + (f":fabric={g['fabric']}" if "fabric" in g else "")
-        for g in words
+        with_default_fabric([str(place)], g.get("fabric"))[0]
+        for place, g in zip(places, words, strict=True)
     ]
     options = {
         k: _resolve_path(path, v) if k in ("skeleton", "joint_map") else v

@@ -45,7 +45,7 @@ def settle_on_body(
         Cundall, Explicit finite-difference methods in geomechanics (1976), for the velocity
         resets.
     """
-    scene = prepare_scene(Scene((garment,), standard_effects(1), body))
+    scene = prepare_scene(Scene((garment,), standard_effects((garment,)), body))
     x = rest = np.asarray(garment.mesh.vertices if start is None else start, np.float64)
     for k in range(_MAX_INTERVALS):
         if progress is not None:

@@ -107,11 +107,11 @@ def build_scene(
         also: Additional effects; each replaces an effect of the same type.
     """
     ordered = layer_order(garments)
-    return Scene(tuple(ordered), _active_effects(simulation, len(ordered), also), body, shape)
+    return Scene(tuple(ordered), _active_effects(simulation, ordered, also), body, shape)
 
 
 def _active_effects(
-    simulation: Simulation, garments: int, also: Sequence[Effect] = ()
+    simulation: Simulation, garments: Sequence[Garment], also: Sequence[Effect] = ()
 ) -> tuple[Effect, ...]:
     also = (*simulation.also, *also)
     if simulation.effects is not None:
@@ -186,10 +186,3 @@ def _merge_effects(effects: Sequence[Effect], also: Sequence[Effect]) -> tuple[E
     new = {type(e) for e in also}
     others = [e for e in effects if type(e) not in new]
     return tuple(sorted((*others, *also), key=lambda e: rank.get(type(e), custom)))
-
-
-def acting_effects(simulation: Simulation, garments: int) -> tuple[str, ...]:
-    """Names of the effects of a simulation; empty for an external engine."""
-    if simulation.engine in EXTERNAL_ENGINES:
-        return ()
-    return tuple(type(e).__name__ for e in _active_effects(simulation, garments))

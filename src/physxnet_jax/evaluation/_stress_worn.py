@@ -119,7 +119,7 @@ def run_own(
     """
     peer = PEER_CASES[name]
     garments, motion = peer.garments(), peer.motion()
-    effects = standard_effects(len(garments)) if effects is None else effects
+    effects = standard_effects(garments) if effects is None else effects
     (out,) = simulate_batch(prepare_scene(Scene(garments, effects)), [motion])
     seen = outcome(garments, motion, np.concatenate(out.positions, axis=1), peer.bounds)
     return out, iter([(k, peer.bounds[k], seen[k]) for k in peer.bounds])

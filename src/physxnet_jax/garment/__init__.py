@@ -10,6 +10,7 @@ from ._garment import (
     Garment as Garment,
     Template as Template,
 )
+from ._holds import holding_loops as holding_loops
 from ._load import (
     ELSEWHERE as ELSEWHERE,
     HANGS as HANGS,
@@ -50,4 +51,12 @@ from ._wear import (
     parse_wear as parse_wear,
     with_default_fabric as with_default_fabric,
     with_fabric as with_fabric,
+)
+from .tailor import (
+    KINDS as KINDS,
+    MEASURES as MEASURES,
+    Kind as Kind,
+    cut_vertices as cut_vertices,
+    resolve_measures as resolve_measures,
+    tailor as tailor,
 )

@@ -99,6 +99,8 @@ class Garment:
             only triangles.
         coarse_faces: Triangles of the mesh that this one refines, on its first vertices. They,
             too, are kept off the skin. None if it refines none.
+        loops: Edges of named curves around it (``waist``, ``hem``), each of shape [edges, 2].
+        elastic: Names of the loops that are sewn to an elastic band.
     """
 
     mesh: TriMesh
@@ -112,6 +114,8 @@ class Garment:
     name: str = dataclasses.field(metadata={"static": True})
     polygons: Polygons | None = dataclasses.field(default=None, metadata={"static": True})
     coarse_faces: Int[Array, "coarse 3"] | None = None
+    loops: dict[str, Int[Array, "edges 2"]] = dataclasses.field(default_factory=dict)
+    elastic: tuple[str, ...] = dataclasses.field(default=(), metadata={"static": True})
 
     @property
     def num_vertices(self) -> int:

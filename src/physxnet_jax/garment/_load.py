@@ -3,11 +3,12 @@
 import dataclasses
 import pathlib
 import shlex
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int
 
 from ..body import Body, load_body
 from ..errors import MeshError, PhysXNetError
@@ -24,7 +25,8 @@ from ._fit import clearance, lift_out
 from ._garment import COTTON, TEMPLATES, Garment, Template
 from ._locate import locate_on_body, nearest_skin
 from ._templates import template
-from ._wear import parse_wear, with_fabric
+from ._wear import WearItem, parse_wear, with_fabric
+from .tailor import KINDS, tailor
 
 NEAREST = 0.003
 # Share of vertices inside the body above which a garment may be misplaced [1].
@@ -32,6 +34,10 @@ ELSEWHERE = 0.1
 # Largest distance of the highest tenth from the skin, and longest edge, without a warning [m].
 HANGS, LONG = 0.02, 0.04
 _TOP_SHARE = 0.1
+# A garment that ends below this doesn't rest on the shoulders [m].
+_SHOULDERS = 0.42
+# A border farther from the skin than this doesn't lie around the body [m].
+_AROUND = 0.05
 # Height of the crotch [m], smallest share of vertices [1] and lateral offset [m] of a leg.
 _CROTCH, _LEG_SHARE, _LEG_OFFSET = -0.2, 0.15, 0.02
 
@@ -89,8 +95,9 @@ def load_garment(
     path: str | pathlib.Path,
     *,
     body: Body | None = None,
+    shape: Float[Array, " shapes"] | None = None,
 ) -> tuple[Garment, GarmentReport]:
-    """Loads a garment from a file modelled on the body, or a template by name.
+    """Loads a garment from a file modelled on the body, or makes one by its name.
 
     The unit and up axis are those that place the mesh on the body. Vertices inside the skin
     move to 3 mm outside. Each vertex is attached to the closest skin. Far from the skin,
@@ -98,9 +105,10 @@ def load_garment(
 
     Args:
         path: A file that `read_mesh` reads (``coat.glb#sleeves`` selects one of several
-            meshes), or ``top``, ``bottom`` or ``dress``; options follow a colon, see
-            `parse_wear`.
+            meshes), a template (``top``, ``bottom`` or ``dress``) or a kind that the tailor
+            makes (`KINDS`); options follow a colon, see `parse_wear`.
         body: The body; the built-in one by default.
+        shape: Shape parameters of the person that tailored garments are cut for.
 
     Returns:
         The garment and a report.
@@ -111,8 +119,21 @@ def load_garment(
     """
     body = load_body() if body is None else body
     item = parse_wear(path)
+    if item.name in KINDS:
+        return _tailored(item, shape)
     garment, report = _load(item.name, item.template, body)
     return garment if item.fabric is None else with_fabric(garment, item.fabric), report
+
+
+def _tailored(
+    item: WearItem, shape: Float[Array, " shapes"] | None
+) -> tuple[Garment, GarmentReport]:
+    options: dict[str, Any] = dict(item.measures)
+    garment = tailor(item.name, **options, fabric=item.fabric, hold=item.hold, shape=shape)
+    v, faces = np.asarray(garment.mesh.vertices), np.asarray(garment.mesh.faces)
+    distance, _ = clearance(load_body().rest_mesh(), v)
+    inside = np.zeros(len(v), dtype=bool)
+    return garment, _report(item.name, "m", "Y", v, faces, inside, distance, garment.template)
 
 
 def _load(
@@ -131,9 +152,9 @@ def _load(
     path = pathlib.Path(path)
     if split_part(path)[0].suffix.lower() not in GARMENT_FORMATS:
         raise MeshError(
-            f"{path}: a garment is one of {', '.join(TEMPLATES)} (append"
-            f" ':as=top' to a file's name to select one) or a"
-            f" file of triangles or quads: {', '.join(GARMENT_FORMATS)}."
+            f"{path}: a garment is one of {', '.join((*KINDS, *TEMPLATES))} or a file of triangles"
+            f" or quads: {', '.join(GARMENT_FORMATS)} (':as=top' after its name dresses it like a"
+            " template)."
         )
     raw = read_mesh(path)
     mesh = body.rest_mesh()
@@ -198,9 +219,10 @@ def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
     refs, shares, weights = nearest_skin(skin, body, v, faces)
     closest = jnp.einsum("vk,vkc->vc", shares, rest[refs], precision=jax.lax.Precision.HIGHEST)
     pinned = np.zeros(len(v), dtype=bool)
-    loops = boundary_loops(faces)
-    if kind == "bottom" and loops:
-        pinned[max(loops, key=lambda x: v[x, 1].mean())] = True
+    borders = boundary_loops(faces)
+    if kind == "bottom" and borders:
+        pinned[max(borders, key=lambda x: v[x, 1].mean())] = True
+    band = None if kind == "bottom" else _band(v, borders, np.asarray(points - closest))
     # Vertices that no face uses are pinned: otherwise they would fall out of the scene.
     pinned[np.setdiff1d(np.arange(len(v)), faces)] = True
     return Garment(
@@ -213,7 +235,27 @@ def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
         COTTON,
         kind,
         name,
+        loops={} if band is None else {"waist": band},
+        elastic=() if band is None else ("waist",),
     )
+
+
+def _band(
+    v: Float[np.ndarray, "vertices 3"],
+    borders: list[Int[np.ndarray, " _"]],
+    gap: Float[np.ndarray, "vertices 3"],
+) -> Int[Array, "edges 2"] | None:
+    """Edges of the upper border, where nothing of a garment rests on the shoulders.
+
+    A skirt or a strapless dress needs a band; what doesn't lie around the body has none.
+    """
+    if not borders:
+        return None
+    upper = max(borders, key=lambda loop: v[loop, 1].mean())
+    far = float(np.linalg.norm(gap[upper], axis=1).mean())
+    if v[upper, 1].max() >= _SHOULDERS or far >= _AROUND:
+        return None
+    return jnp.asarray(np.column_stack([upper, np.roll(upper, -1)]).astype(np.int32))
 
 
 def guess_template(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 from ..errors import PhysXNetError
 from ._garment import FABRICS, TEMPLATES, Garment, Template
+from .tailor import KINDS, MEASURES
 
 _OPTIONS = re.compile(r"^(?P<name>.+?):(?P<options>\w+=[^:,=]*(?:,\w+=[^:,=]*)*)$")
 
@@ -16,28 +17,43 @@ class WearItem:
     """A garment's name with its options.
 
     Attributes:
-        name: A template, or a garment file.
+        name: A template, a kind that the tailor makes, or a garment file.
         template: Template that dresses a file (``as``); guessed from its shape if None.
         fabric: Name of a fabric that replaces its own; None keeps it.
+        measures: Measures of a tailored garment [m].
+        hold: Curves of a tailored garment that are fixed to the body.
     """
 
     name: str
     template: Template | None = None
     fabric: str | None = None
+    measures: dict[str, float] = dataclasses.field(default_factory=dict)
+    hold: tuple[str, ...] = ()
+
+    def word(self, name: str) -> str:
+        """The word that `parse_wear` reads, under another name and without the fabric."""
+        options = [f"as={self.template}"] if self.template else []
+        options += [f"{k}={v:g}" for k, v in self.measures.items()]
+        options += [f"hold={'+'.join(self.hold)}"] if self.hold else []
+        return f"{name}:{','.join(options)}" if options else name
 
 
 def parse_wear(word: str | pathlib.Path) -> WearItem:
-    """Parses ``NAME[:key=value,...]``; keys are ``as`` and ``fabric``.
+    """Parses ``NAME[:key=value,...]``.
 
     Args:
-        word: A template or a file, with its options.
+        word: A template, a kind of garment or a file, with its options: ``fabric``; for a file
+            ``as``, its template; for a tailored garment its measures [m] and ``hold``, curves
+            joined by ``+`` that are fixed to the body.
 
     Raises:
-        PhysXNetError: A key, template or fabric is unknown.
+        PhysXNetError: A key, template, fabric or number is wrong.
 
     Example:
         >>> parse_wear("coat.obj:as=top,fabric=wool")
-        WearItem(name='coat.obj', template='top', fabric='wool')
+        WearItem(name='coat.obj', template='top', fabric='wool', measures={}, hold=())
+        >>> parse_wear("tee:ease=0.1").measures
+        {'ease': 0.1}
     """
     found = _OPTIONS.match(str(word))
     if found is None:
@@ -45,13 +61,33 @@ def parse_wear(word: str | pathlib.Path) -> WearItem:
     pairs = (part.partition("=") for part in found["options"].split(","))
     options = {key: value for key, _, value in pairs}
     known = {"as": TEMPLATES, "fabric": tuple(FABRICS)}
+    tailored = found["name"] in KINDS
+    allowed = ("fabric", "hold", *MEASURES) if tailored else ("as", "fabric")
+    measures = {}
     for key, value in options.items():
-        if key not in known:
-            raise PhysXNetError(f"{word}: no option '{key}'; there are {', '.join(known)}.")
-        if value not in known[key]:
+        if key not in allowed:
+            raise PhysXNetError(f"{word}: no option '{key}'; there are {', '.join(allowed)}.")
+        if key in known and value not in known[key]:
             raise PhysXNetError(f"{word}: {key} is one of {', '.join(known[key])}.")
+        if key in MEASURES:
+            measures[key] = _number(word, key, value)
     template: Template | None = options.get("as")  # pyright: ignore[reportAssignmentType]
-    return WearItem(name=found["name"], template=template, fabric=options.get("fabric"))
+    return WearItem(
+        name=found["name"],
+        template=template,
+        fabric=options.get("fabric"),
+        measures=measures,
+        hold=tuple(options["hold"].split("+")) if "hold" in options else (),
+    )
+
+
+def _number(word: str | pathlib.Path, key: str, value: str) -> float:
+    try:
+        return float(value)
+    except ValueError:
+        raise PhysXNetError(
+            f"{word}: {key} is '{value}', expected metres, as in {key}=0.1."
+        ) from None
 
 
 def with_default_fabric(words: Sequence[str], fabric: str | None) -> tuple[str, ...]:

@@ -183,6 +183,20 @@ def _spin(t: Time) -> tuple[Turns, Time]:
     return turns, np.zeros_like(t)
 
 
+def _squat(t: Time) -> tuple[Turns, Time]:
+    down = _ease(np.mod(t, 2.6), 0.1, 0.9) - _ease(np.mod(t, 2.6), 1.5, 2.3)
+    thigh, knee = _about(-_X, 1.75 * down), _about(_X, 2.1 * down)
+    foot, arm = _about(-_X, 0.5 * down), _about(-_X, 1.3 * down)
+    turns = {
+        **_pair(thigh, thigh, "UpLeg"),
+        **_pair(knee, knee, "Leg"),
+        **_pair(foot, foot, "Foot"),
+        **_pair(arm, arm, "Arm"),
+        "LowerBack": _about(_X, 0.5 * down),
+    }
+    return turns, np.zeros_like(t)
+
+
 CLIPS: dict[str, Callable[[Time], tuple[Turns, Time]]] = {
     "walk": _walk,
     "jump": _jump,
@@ -192,6 +206,7 @@ CLIPS: dict[str, Callable[[Time], tuple[Turns, Time]]] = {
     "balance": _balance,
     "stretch": _stretch,
     "spin": _spin,
+    "squat": _squat,
 }
 """Built-in clips: joint rotations and height of the feet above the floor [m] over time."""
 

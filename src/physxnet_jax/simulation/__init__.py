@@ -2,7 +2,7 @@
 
 from ._advance import advance as advance, start_state as start_state
 from ._assembly import Assembly as Assembly
-from ._diagnostics import Rollout as Rollout, Status as Status
+from ._diagnostics import OFF as OFF, Rollout as Rollout, Status as Status
 from ._effect import (
     Clock as Clock,
     Effect as Effect,
@@ -27,6 +27,7 @@ from ._scene import (
     prepare_scene as prepare_scene,
     standard_effects as standard_effects,
 )
+from ._slip import slipped as slipped
 from ._solver import Solver as Solver
 from ._state import State as State
 from ._static_body import settle_on_static_body as settle_on_static_body

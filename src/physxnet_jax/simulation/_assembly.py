@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body
-from ..garment import Garment
+from ..garment import Garment, holding_loops
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +31,8 @@ class Assembly:
         loose: Vertices that may touch any limb (skirts), shape [vertices].
         parts: First vertex of each garment, followed by the number of vertices.
         coarse_faces: Triangles of the meshes that garments refine, shape [coarse, 3].
+        bands: Edges of elastic bands, shape [bands, 2].
+        holds: For each garment, the vertices of each curve that holds it up.
     """
 
     body: Body
@@ -48,6 +50,12 @@ class Assembly:
     loose: Bool[np.ndarray, " vertices"]
     parts: tuple[int, ...]
     coarse_faces: Int[np.ndarray, "coarse 3"]
+    bands: Int[np.ndarray, "bands 2"]
+    holds: tuple[tuple[Int[np.ndarray, " _"], ...], ...]
+
+
+# Friction of elastic bands, which are made to grip [1].
+_GRIP = 0.8
 
 
 def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " shapes"]) -> Assembly:
@@ -56,8 +64,8 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
     rest, faces, mass, pinned, weights = [], [], [], [], []
     per_vertex: dict[str, list] = {"thickness": [], "friction": []}
     per_face: dict[str, list] = {"stretch": [], "bend": [], "membrane": []}
-    loose, coarse = [], [np.zeros((0, 3), np.int64)]
-    parts = [0]
+    loose, coarse, bands = [], [np.zeros((0, 3), np.int64)], [np.zeros((0, 2), np.int64)]
+    parts, holds = [0], []
     for g in garments:
         x = np.asarray(g.rest_vertices(rest_body), dtype=np.float64)
         f = np.asarray(g.mesh.faces)
@@ -76,10 +84,16 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         pinned.append(np.asarray(g.pinned))
         weights.append(np.asarray(g.skin, dtype=np.float64))
         per_vertex["thickness"].append(np.full(len(x), g.fabric.thickness))
-        per_vertex["friction"].append(np.full(len(x), g.fabric.friction))
+        friction = np.full(len(x), g.fabric.friction)
+        for name in g.elastic:
+            band = np.asarray(g.loops[name])
+            friction[band] = max(g.fabric.friction, _GRIP)
+            bands.append(band + parts[-1])
+        per_vertex["friction"].append(friction)
         per_face["stretch"].append(np.full(len(f), g.fabric.stretch))
         per_face["bend"].append(np.full(len(f), g.fabric.bend))
         per_face["membrane"].append(np.tile(g.fabric.membrane, (len(f), 1)))
+        holds.append(tuple(c + parts[-1] for c in holding_loops(g).values()))
         loose.append(_loose_vertices(g, x, np.asarray(rest_body, np.float64)))
         parts.append(parts[-1] + len(x))
     cat = np.concatenate
@@ -99,6 +113,8 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         cat(loose),
         tuple(parts),
         cat(coarse),
+        cat(bands),
+        tuple(holds),
     )
 
 

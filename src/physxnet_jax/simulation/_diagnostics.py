@@ -30,6 +30,8 @@ class Status(enum.IntFlag):
     """More than one vertex in two hundred is on the wrong side of another layer."""
     OVERFLOW = 256
     """A grid cell of `SelfContact` received more vertices than it can hold."""
+    OFF = 512
+    """A garment's waist, upper border or neckline has slid more than 8 cm along the body."""
 
     @property
     def advice(self) -> str:
@@ -38,6 +40,8 @@ class Status(enum.IntFlag):
 
 
 _STRAIN, _INSIDE, _SPEED = 0.5, 0.01, 50.0
+OFF = 0.08
+"""A garment whose waist, upper border or neckline has slid farther than this is off [m]."""
 # Single vertices in armpits do no harm: this share of all is "many".
 _MANY = 0.02
 # Between layers less than that shows.
@@ -52,6 +56,7 @@ _ADVICE = {
     Status.PINCHED: "limbs pass through the body: correct the motion there",
     Status.CROSSED: "less wind, or --accuracy fine",
     Status.OVERFLOW: "a coarser mesh: physxnet fit GARMENT --edge-length",
+    Status.OFF: "a closer fit, or hold it: skirt:hold=waist",
 }
 _CAUSES = {
     Status.FAST: "a teleport in the motion",
@@ -73,7 +78,8 @@ class Rollout:
             (1 is the tolerance of 0.5 mm). The scene's effects add ``strain_max``,
             ``strain_p99`` [1], ``penetration_max`` [m], ``inside_share``, ``missed``,
             ``pinched`` (vertices), ``layers_crossed``, ``layers_depth`` [m],
-            ``self_gap`` [m] and ``overflow``; ``energy_...`` [J] if requested.
+            ``self_gap`` [m] and ``overflow``; ``energy_...`` [J] if requested. ``slipped`` [m] is
+            how far the garment that slid farthest has slid, see `slipped`.
         name: Name of the motion.
         vertices: Number of vertices that were simulated, if there were more than are returned.
     """
@@ -120,6 +126,7 @@ class Rollout:
             | bit(Status.PINCHED, d.get("pinched", nothing) > many)
             | bit(Status.CROSSED, d.get("layers_crossed", nothing) > _CROSSING * vertices)
             | bit(Status.OVERFLOW, d.get("overflow", nothing) > 0)
+            | bit(Status.OFF, d.get("slipped", nothing) > OFF)
         )
 
     def check(self) -> None:

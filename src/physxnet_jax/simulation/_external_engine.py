@@ -21,6 +21,7 @@ from ._assembly import float32
 from ._diagnostics import Rollout
 from ._prepared_scene import PreparedScene
 from ._rollout import warmup
+from ._slip import slipped
 
 
 def run_external_engine(
@@ -98,6 +99,7 @@ def run_external_engine(
         "residual_p99": np.zeros(len(positions)),
         "penetration_max": _max_depth(positions, arrays["skin"][first:], arrays["skin_faces"]),
         "milliseconds": milliseconds[first:],
+        "slipped": slipped(assembly, motion, positions).max(axis=1, initial=0.0),
     }
     garments = tuple(positions[:, i:j] for i, j in zip(assembly.parts, assembly.parts[1:]))
     return Rollout(garments, motion.fps, diagnostics, motion.name)

@@ -19,6 +19,7 @@ from ._diagnostics import Rollout
 from ._prepared_scene import PreparedScene
 from ._resume import Resume, fingerprint
 from ._scene import Scene, make_system, prepare_scene
+from ._slip import slipped
 from ._solver import Solver
 from ._xpbd import XPBD
 
@@ -234,11 +235,13 @@ def _roll(
         frames = slice(warmup_frames - 1, warmup_frames - 1 + m.num_frames)
         flags = slice(warmup_frames - 2, warmup_frames - 2 + m.num_frames)
         garments = zip(scene.assembly.parts, scene.assembly.parts[1:])
+        cloth = every[frames, :, :, b]
+        slid = slipped(scene.assembly, m, cloth).max(axis=1, initial=0.0)
         out.append(
             Rollout(
-                tuple(np.ascontiguousarray(every[frames, i:j, :, b]) for i, j in garments),
+                tuple(np.ascontiguousarray(cloth[:, i:j]) for i, j in garments),
                 fps,
-                {k: v[flags, b] for k, v in values.items()},
+                {k: v[flags, b] for k, v in values.items()} | {"slipped": slid},
                 m.name,
             )
         )

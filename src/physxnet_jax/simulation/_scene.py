@@ -1,6 +1,7 @@
 """Scenes: garments on a body and the effects that act on them."""
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -22,6 +23,7 @@ from .effects import (
     BodyContact,
     Damping,
     Dihedral,
+    Elastic,
     Gravity,
     LayerContact,
     Membrane,
@@ -41,6 +43,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "bend": Bend,
     "dihedral": Dihedral,
     "seam": Seam,
+    "elastic": Elastic,
     "strain_limit": StrainLimit,
     "self_contact": SelfContact,
     "layer_contact": LayerContact,
@@ -60,12 +63,13 @@ STANDARD: tuple[Effect, ...] = (
 """Default effects for the clothes of a moving person, in their order of application."""
 
 
-def standard_effects(garments: int) -> tuple[Effect, ...]:
-    """`STANDARD`, with `LayerContact` if there is more than one garment."""
-    if garments < 2:
-        return STANDARD
+def standard_effects(garments: Sequence[Garment]) -> tuple[Effect, ...]:
+    """`STANDARD`, with `LayerContact` between several garments and `Elastic` where one has it."""
+    more: list[Effect] = [Elastic()] if any(g.elastic for g in garments) else []
+    if len(garments) > 1:
+        more.append(LayerContact())
     at = [type(e) for e in STANDARD].index(BodyContact)
-    return (*STANDARD[:at], LayerContact(), *STANDARD[at:])
+    return (*STANDARD[:at], *more, *STANDARD[at:])
 
 
 @dataclasses.dataclass(frozen=True)

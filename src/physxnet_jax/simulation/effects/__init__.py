@@ -5,6 +5,7 @@ from ._bend import Bend as Bend
 from ._contact import BodyContact as BodyContact
 from ._damping import Damping as Damping
 from ._dihedral import Dihedral as Dihedral
+from ._elastic import Elastic as Elastic
 from ._gravity import Gravity as Gravity
 from ._layers import LayerContact as LayerContact
 from ._membrane import Membrane as Membrane

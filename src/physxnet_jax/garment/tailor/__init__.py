@@ -1,0 +1,10 @@
+"""The tailor: garments cut to measure from patterns drawn on the body's helper geometry."""
+
+from ._build import build_charts as build_charts
+from ._cut import (
+    cut_vertices as cut_vertices,
+    draw_usual_pattern as draw_usual_pattern,
+    resolve_measures as resolve_measures,
+)
+from ._measures import KINDS as KINDS, MEASURES as MEASURES, Kind as Kind, Range as Range
+from ._tailor import tailor as tailor
