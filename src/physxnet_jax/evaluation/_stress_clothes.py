@@ -2,13 +2,13 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import jax.numpy as jnp
 import numpy as np
 
 from ..body import load_body
-from ..garment import Garment, carried, subdivide, template
+from ..garment import Garment, carried, subdivide, tailor, template
 from ..geometry import boundary_loops, make_mesh, vertex_normals
 from ..motion import Motion, load_motion
 from ._stress import CASES
@@ -18,6 +18,7 @@ from ._stress_worn import (
     LAST_STRAIN,
     NOT_FINITE,
     PEER_CASES,
+    SLID,
     VISIBLE_INNER,
     VISIBLE_SKIN,
     PeerCase,
@@ -102,6 +103,11 @@ def _top_over_trousers() -> tuple[Garment, ...]:
     return template("bottom"), template("top")
 
 
+def _cut(kind: str) -> Callable[[], tuple[Garment, ...]]:
+    """A garment of the tailor at its usual measures."""
+    return lambda: (tailor(kind),)
+
+
 def _crossed_arms() -> Motion:
     """Both arms swing forwards and cross in front of the chest."""
     return arm_motion(axis=1, angle=1.9)
@@ -124,6 +130,20 @@ _CLOTHES = {
     "sleeves_on_crossed_arms": PeerCase(one("top"), _crossed_arms, _BOUNDS | {VISIBLE_SKIN: 0.2}),
     "a_top_over_trousers": PeerCase(
         _top_over_trousers, lambda: _clip("side step", 60), _BOUNDS | {VISIBLE_INNER: 0.1}
+    ),
+}
+_TAILORED = {NOT_FINITE: 0.0, LAST_STRAIN: 0.35, LAST_INSIDE: 0.5, SLID: 80.0, VISIBLE_SKIN: 0.1}
+_CLOTHES |= {
+    "a_squat_in_a_skirt": PeerCase(_cut("pencil-skirt"), lambda: _clip("squat", 60), _TAILORED),
+    "a_full_skirt_spun_and_stopped": PeerCase(
+        _cut("full-skirt"), lambda: _clip("spin", 90), _TAILORED
+    ),
+    "a_strapless_dress_on_jumps": PeerCase(
+        _cut("strapless-dress"), lambda: _clip("jump", 60), _TAILORED
+    ),
+    # The forearms pass through each other.
+    "wide_sleeves_on_crossed_arms": PeerCase(
+        _cut("loose"), _crossed_arms, _TAILORED | {VISIBLE_SKIN: 0.2}
     ),
 }
 PEER_CASES |= _CLOTHES

@@ -21,6 +21,7 @@ from ..simulation import (
     prepare_scene,
     settle_on_static_body,
     simulate_batch,
+    slipped,
     standard_effects,
 )
 from ..simulation.effects import BodyContact, Pin
@@ -36,6 +37,7 @@ LAST_INSIDE = "vertices inside at the end (%)"
 FALLEN = "median distance from skinned cloth at the end (m)"
 VISIBLE_SKIN = "visible skin (% of pixels)"
 VISIBLE_INNER = "visible inner garment (% of pixels)"
+SLID = "slid along the body (mm)"
 
 
 def _run(motion: Motion, name: Template = "top") -> Rollout:
@@ -84,6 +86,8 @@ def outcome(
         body_rest = jnp.asarray(assembly.rest_body, jnp.float32)
         skinned = np.asarray(animate(assembly.body, body_rest, rest, weights, still))
         out[FALLEN] = float(np.median(np.linalg.norm(last - skinned, axis=2)))
+    if SLID in out:
+        out[SLID] = 1e3 * float(slipped(assembly, motion, positions).max())
     if LAST_INSIDE in out:
         seen = penetration(assembly, still, last)
         out[LAST_INSIDE] = 100 * float((seen.cloth_inside & ~seen.pinched).mean())

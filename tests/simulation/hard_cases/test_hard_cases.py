@@ -72,6 +72,15 @@ def vertices_only() -> tuple[Effect, ...]:
             "visible inner",
             marks=release,
         ),
+        *(
+            pytest.param(name, without(BodyContact), "slid along", marks=release)
+            for name in (
+                "a_squat_in_a_skirt",
+                "a_full_skirt_spun_and_stopped",
+                "a_strapless_dress_on_jumps",
+                "wide_sleeves_on_crossed_arms",
+            )
+        ),
     ],
 )
 def test_hard_clothes_break_their_bound_without_the_guard(name, effects, quantity):
