@@ -12,7 +12,13 @@ import numpy as np
 from rich.progress import track
 
 from physxnet_jax.body import load_body
-from physxnet_jax.garment.tailor import KINDS, MEASURES, build_charts, draw_usual_pattern
+from physxnet_jax.garment.tailor import (
+    KINDS,
+    MEASURES,
+    build_charts,
+    draw_usual_pattern,
+    measure_usual_arm,
+)
 
 OUT = pathlib.Path("src/physxnet_jax/garment/assets")
 
@@ -41,7 +47,7 @@ def kinds_table() -> str:
 
 def main() -> None:
     write("charts_cc0.npz", build_charts(load_body()))
-    patterns: dict[str, np.ndarray] = {}
+    patterns: dict[str, np.ndarray] = {"usual_arm": np.asarray(measure_usual_arm())}
     for name in track(KINDS, description="patterns"):
         patterns |= draw_usual_pattern(name)
     write("patterns_cc0.npz", patterns)

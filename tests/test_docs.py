@@ -14,7 +14,7 @@ from physxnet_jax.cli._configs import read_config
 from physxnet_jax.data import DatasetConfig, read_protocol
 from physxnet_jax.dressing import dress, load_scene
 from physxnet_jax.evaluation import CASES, ActionError, error_tables, means, summary_table
-from physxnet_jax.garment import FABRICS, TEMPLATES
+from physxnet_jax.garment import FABRICS, KINDS, TEMPLATES
 from physxnet_jax.models import list_weights, read_card
 from physxnet_jax.motion import read_joint_map
 from physxnet_jax.simulation import EFFECTS
@@ -233,6 +233,14 @@ def test_reproduction_page_matches_the_measurements():
             assert found is not None
             assert round(found["rmse_vertices_mm"], 2) == line["rmse_vertices_mm"]
         assert card["licence"] and card["acknowledgement"]
+
+
+def test_wardrobe_table_matches_the_measurements():
+    text = (ROOT / "docs/garments.md").read_text()
+    part = text.partition("<!-- begin wardrobe -->\n")[2].partition("<!-- end wardrobe -->")[0]
+    assert part == (ROOT / "experiments/results/wardrobe.md").read_text()
+    rows = json.loads((ROOT / "experiments/results/wardrobe.json").read_text())
+    assert {r["kind"] for r in rows} == set(KINDS)
 
 
 def test_kinds_of_the_tailor_are_those_of_the_page():

@@ -185,8 +185,8 @@ def _spin(t: Time) -> tuple[Turns, Time]:
 
 def _squat(t: Time) -> tuple[Turns, Time]:
     down = _ease(np.mod(t, 2.6), 0.1, 0.9) - _ease(np.mod(t, 2.6), 1.5, 2.3)
-    thigh, knee = _about(-_X, 1.75 * down), _about(_X, 2.1 * down)
-    foot, arm = _about(-_X, 0.5 * down), _about(-_X, 1.3 * down)
+    thigh, knee = _about(-_X, 1.45 * down), _about(_X, 1.8 * down)
+    foot, arm = _about(-_X, 0.45 * down), _about(-_X, 1.3 * down)
     turns = {
         **_pair(thigh, thigh, "UpLeg"),
         **_pair(knee, knee, "Leg"),

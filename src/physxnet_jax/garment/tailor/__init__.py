@@ -4,6 +4,7 @@ from ._build import build_charts as build_charts
 from ._cut import (
     cut_vertices as cut_vertices,
     draw_usual_pattern as draw_usual_pattern,
+    measure_usual_arm as measure_usual_arm,
     resolve_measures as resolve_measures,
 )
 from ._measures import KINDS as KINDS, MEASURES as MEASURES, Kind as Kind, Range as Range

@@ -16,7 +16,14 @@ from ._charts import Carrier, ChartName, Charts, carrier, load_charts
 from ._curves import rings
 from ._form import WAIST, Form, heights, make_form, place, ring_points
 from ._measures import Kind, kind_of
-from ._pattern import Pattern, draw_pattern, pattern_arrays, stored_pattern, with_borders
+from ._pattern import (
+    Pattern,
+    draw_pattern,
+    pattern_arrays,
+    stored_number,
+    stored_pattern,
+    with_borders,
+)
 
 # Places of a chart evaluated at once: one program for all.
 _POINTS = 2048
@@ -112,6 +119,12 @@ def _arm_length(bare: Form) -> Array:
 
 @functools.cache
 def _usual_arm() -> float:
+    stored = stored_number("usual_arm")
+    return measure_usual_arm() if stored is None else stored
+
+
+def measure_usual_arm() -> float:
+    """Length of the default shape's arms along the middles of their rings [m]."""
     body = load_body()
     with jax.ensure_compile_time_eval():
         surface = _carrier_of(body.rest_vertices(body.default_shape()))
@@ -150,8 +163,8 @@ def _fitted(name: str, measures, rest, surface: Carrier, hem):
 
 
 @functools.partial(jax.jit, static_argnames="chart")
-def _placed(surface: Carrier, off, uv, chart: ChartName):
-    return place(Form(surface, off), load_charts(), chart, uv)[0]
+def _placed(surface: Carrier, off, uv, chart: ChartName, over):
+    return place(Form(surface, off, over), load_charts(), chart, uv)[0]
 
 
 @functools.partial(jax.jit, static_argnames="name")
@@ -186,13 +199,14 @@ def draw_class(name: str, ends: tuple[tuple[str, float, float], ...]) -> Pattern
                 triples.setdefault(level, []).append(float(value))
         middle = measures | {k: jnp.asarray(v[1], jnp.float32) for k, v in limits.items()}
         hem = jnp.asarray(triples["hem"][1], jnp.float32)
-        form = Form(surface, _fitted(name, middle, rest, surface, hem))
+        form = Form(surface, _fitted(name, middle, rest, surface, hem), kind.over)
 
         def at(chart: ChartName, uv: np.ndarray) -> np.ndarray:
             size = -(-len(uv) // _POINTS) * _POINTS
             padded = np.resize(uv, (size, 2)).astype(np.float32)
             points = [
-                _placed(form.carrier, form.off, p, chart) for p in padded.reshape(-1, _POINTS, 2)
+                _placed(form.carrier, form.off, p, chart, kind.over)
+                for p in padded.reshape(-1, _POINTS, 2)
             ]
             return np.concatenate([np.asarray(p, np.float64) for p in points])[: len(uv)]
 

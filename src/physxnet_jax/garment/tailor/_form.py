@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -29,6 +30,7 @@ _WAIST_EASE = {"trousers": 0.012, "skirt": 0.012, "dress": 0.05, "strapless-dres
 # What the bare carrier is wider than the skin that a tape measures [m].
 _SNUG = 0.05
 _ANKLE = -0.73
+# A ring's length grows by 2 pi times what it is moved outwards, but for its hollows: a few steps.
 STEPS = 4
 
 
@@ -39,10 +41,12 @@ class Form:
     Attributes:
         carrier: The body's smooth surface.
         off: How far cloth stands off it at each ring of trunk, legs, arms and skirt [m].
+        over: Room that is left for another garment below [m].
     """
 
     carrier: Carrier
     off: Mapping[str, Float[Array, " rings"]]
+    over: float = 0.0
 
 
 def place(
@@ -76,7 +80,7 @@ def _stand(form: Form, skirt: bool, nodes: Array, weights: Array, fields: Array)
     off = _off(form, skirt, fields)
     room = _ROOM * fields[:, FREE]
     off = room * jnp.tanh(off / room)
-    return values[:, :3] + (values[:, 6] + off)[:, None] * n
+    return values[:, :3] + (values[:, 6] + form.over + off)[:, None] * n
 
 
 def _off(form: Form, skirt: bool, fields: Float[Array, "points 4"]) -> Float[Array, " points"]:
@@ -134,17 +138,26 @@ def make_form(
         hem: Height of the hem on the default shape [m].
     """
     off = {p: jnp.zeros(len(rings(p).levels)) for p in ("torso", "leg", "arm", "skirt")}
-    form = Form(surface, off)
+    form = Form(surface, off, kind.over)
     tape = {k: t.length(rest) for k, t in charts.tapes.items()}
     level = {k: t.level for k, t in charts.tapes.items()}
     wanted = _wanted(kind, measures, tape, level, form, hem)
     for part, goal in wanted.items():
         bare = perimeters(form, part)
         goal = _wider(goal, bare + _TIGHT)
-        for _ in range(STEPS):
-            now = perimeters(Form(surface, off), part)
-            off = off | {part: off[part] + (goal - now) / (2 * jnp.pi)}
-    return Form(surface, off)
+
+        off = off | {part: _fit_rings(Form(surface, off, kind.over), part, goal)}
+    return Form(surface, off, kind.over)
+
+
+def _fit_rings(form: Form, part: str, goal: Float[Array, " rings"]) -> Float[Array, " rings"]:
+    """How far rings stand off the carrier if they have the lengths of the goal [m]."""
+
+    def step(wide: Array, _: None) -> tuple[Array, None]:
+        now = perimeters(dataclasses.replace(form, off={**form.off, part: wide}), part)
+        return wide + (goal - now) / (2 * jnp.pi), None
+
+    return jax.lax.scan(step, form.off[part], length=STEPS)[0]
 
 
 def _wanted(

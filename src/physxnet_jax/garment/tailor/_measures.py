@@ -36,6 +36,7 @@ class Kind:
         back: Depth of the neckline behind [m].
         round: Exponent of the neckline: 1 is a V, 2 an ellipse, more is square.
         elastic: Borders held by elastic.
+        over: Room that is left for another garment below it [m].
     """
 
     style: Style
@@ -51,6 +52,7 @@ class Kind:
     back: float = 0.02
     round: float = 2.0
     elastic: tuple[str, ...] = ()
+    over: float = 0.0
 
 
 def _range(default: float, low: float, high: float) -> Range:
@@ -123,6 +125,7 @@ KINDS: dict[str, Kind] = {
         classes=_TOP_CLASSES,
         sleeve_ease=0.7,
         neck=0.06,
+        over=0.008,
     ),
     "strapless": Kind(
         style="strapless",

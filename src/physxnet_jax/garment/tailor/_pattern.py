@@ -323,6 +323,12 @@ def _stored() -> dict[str, np.ndarray]:
             return {k: data[k] for k in data.files}
 
 
+def stored_number(name: str) -> float | None:
+    """A number that the package stores beside the patterns; None if it isn't there."""
+    arrays = _stored()
+    return float(arrays[name]) if name in arrays else None
+
+
 def stored_pattern(name: str) -> Pattern | None:
     """The pattern of a kind's usual class from the package; None if it isn't there."""
     arrays = _stored()
