@@ -33,6 +33,7 @@ def test_readme_commands_targets_and_links_exist():
         "inspect",
         "fit",
         "view",
+        "tailor",
     }
     assert words <= there
     with pytest.raises(SystemExit):

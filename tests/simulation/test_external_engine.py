@@ -122,6 +122,10 @@ def test_peer_engines_are_evaluated_from_positions_only():
         "a_cape_on_a_body_that_touches_itself",
         "sleeves_on_crossed_arms",
         "a_top_over_trousers",
+        "a_squat_in_a_skirt",
+        "a_full_skirt_spun_and_stopped",
+        "a_strapless_dress_on_jumps",
+        "wide_sleeves_on_crossed_arms",
     }
 
 
