@@ -169,6 +169,7 @@ __all__ = [
     "make_dresser",
     "pad_clip",
     "simulate",
+    "tailor",
     "template",
     "transference",
     "with_shape",

@@ -162,8 +162,8 @@ def _fitted(name: str, measures, rest, surface: Carrier, hem):
     return make_form(kind_of(name), measures, rest, surface, load_charts(), hem).off
 
 
-@functools.partial(jax.jit, static_argnames="chart")
-def _placed(surface: Carrier, off, uv, chart: ChartName, over):
+@functools.partial(jax.jit, static_argnames=("chart", "over"))
+def _placed(surface: Carrier, off, uv, chart: ChartName, over: float):
     return place(Form(surface, off, over), load_charts(), chart, uv)[0]
 
 
