@@ -208,12 +208,8 @@ def _load_garments(
     character = person.character
     with timed(stages, "garments"):
         # Garments are modelled on the built-in body, then transferred to the character.
-        built_in = character is not None
-        garments, notes = resolve_garments(
-            wear,
-            load_body() if built_in else person.body,
-            None if built_in else person.shape,
-        )
+        body, shape = (person.body, person.shape) if character is None else (load_body(), None)
+        garments, notes = resolve_garments(wear, body, shape)
         if character is not None:
             return [bind_to_character(g, character) for g in garments], notes
         return [move_to_body(person.body, g) for g in garments], notes

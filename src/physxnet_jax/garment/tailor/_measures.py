@@ -74,6 +74,21 @@ _SKIRT_CLASSES = {"length": (0.45, 0.65, 0.90)}
 _DRESS_CLASSES = {"length": (0.85, 1.05, 1.25), "sleeve": (0.30, 0.46)}
 
 
+# Default, least and greatest length of long trousers [m].
+_LONG = (0.82, 0.60, 0.85)
+
+
+def _trousers(summary: str, ease, length, flare, ends=(0.72, 0.85), **more) -> Kind:
+    return Kind(
+        style="trousers",
+        summary=summary,
+        ranges={"ease": _range(*ease), "length": _range(*length), "flare": _range(*flare)},
+        classes={"length": ends},
+        elastic=("waist",),
+        **more,
+    )
+
+
 def _skirt(summary: str, ease, length, flare, **more) -> Kind:
     return Kind(
         style="skirt",
@@ -138,54 +153,20 @@ KINDS: dict[str, Kind] = {
         classes={"length": (0.43,)},
         elastic=("top",),
     ),
-    "slim": Kind(
-        style="trousers",
-        summary="slim trousers",
-        ranges={
-            "ease": _range(0.05, 0.045, 0.09),
-            "length": _range(0.82, 0.60, 0.85),
-            "flare": _range(0.0, -0.03, 0.15),
-        },
-        classes={"length": (0.72, 0.85)},
-        fabric="denim",
-        hem=0.6,
-        elastic=("waist",),
+    "slim": _trousers(
+        "slim trousers", (0.05, 0.045, 0.09), _LONG, (0.0, -0.03, 0.15), fabric="denim", hem=0.6
     ),
-    "trousers": Kind(
-        style="trousers",
-        summary="straight trousers",
-        ranges={
-            "ease": _range(0.06, 0.03, 0.16),
-            "length": _range(0.82, 0.60, 0.85),
-            "flare": _range(0.0, -0.06, 0.30),
-        },
-        classes={"length": (0.72, 0.85)},
-        hem=0.8,
-        elastic=("waist",),
+    "trousers": _trousers(
+        "straight trousers", (0.06, 0.03, 0.16), _LONG, (0.0, -0.06, 0.30), hem=0.8
     ),
-    "wide": Kind(
-        style="trousers",
-        summary="wide trousers",
-        ranges={
-            "ease": _range(0.14, 0.08, 0.26),
-            "length": _range(0.82, 0.60, 0.85),
-            "flare": _range(0.06, 0.0, 0.30),
-        },
-        classes={"length": (0.72, 0.85)},
+    "wide": _trousers("wide trousers", (0.14, 0.08, 0.26), _LONG, (0.06, 0.0, 0.30), hip_ease=0.8),
+    "shorts": _trousers(
+        "shorts",
+        (0.10, 0.03, 0.24),
+        (0.42, 0.36, 0.60),
+        (0.0, -0.02, 0.30),
+        ends=(0.48, 0.60),
         hip_ease=0.8,
-        elastic=("waist",),
-    ),
-    "shorts": Kind(
-        style="trousers",
-        summary="shorts",
-        ranges={
-            "ease": _range(0.10, 0.03, 0.24),
-            "length": _range(0.42, 0.36, 0.60),
-            "flare": _range(0.0, -0.02, 0.30),
-        },
-        classes={"length": (0.48, 0.60)},
-        hip_ease=0.8,
-        elastic=("waist",),
     ),
     "pencil-skirt": _skirt(
         "narrow skirt", (0.05, 0.03, 0.12), (0.56, 0.32, 0.75), (0.0, -0.04, 0.10), fabric="denim"

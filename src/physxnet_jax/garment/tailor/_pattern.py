@@ -123,7 +123,7 @@ def draw_pattern(
             on_axis(pattern[: len(border)], pattern),
             name.rpartition(" ")[2] == "front",
         )
-    owner, faces, loops = _sew(panels, drawn)
+    owner, faces, loops = _sew(panels)
     return Pattern(panels, owner, faces, loops, dict(levels), int(owner.max()) + 1, {})
 
 
@@ -223,7 +223,7 @@ def _harmonic(faces: Int[np.ndarray, "faces 3"], fixed: int, n: int):
 
 
 def _sew(
-    panels: Mapping[str, Panel], drawn: Mapping[str, tuple[ChartName, list[Side]]]
+    panels: Mapping[str, Panel],
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
     """Sews panels to each other and to their mirror images."""
     first, total = {}, 0
