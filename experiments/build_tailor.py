@@ -12,7 +12,7 @@ import numpy as np
 from rich.progress import track
 
 from physxnet_jax.body import load_body
-from physxnet_jax.garment.tailor import (
+from physxnet_jax.garment.tailoring import (
     KINDS,
     MEASURES,
     build_charts,

@@ -52,7 +52,7 @@ from ._wear import (
     with_default_fabric as with_default_fabric,
     with_fabric as with_fabric,
 )
-from .tailor import (
+from .tailoring import (
     KINDS as KINDS,
     MEASURES as MEASURES,
     Kind as Kind,

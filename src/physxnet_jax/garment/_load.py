@@ -26,7 +26,7 @@ from ._garment import COTTON, TEMPLATES, Garment, Template
 from ._locate import locate_on_body, nearest_skin
 from ._templates import template
 from ._wear import WearItem, parse_wear, with_fabric
-from .tailor import KINDS, tailor
+from .tailoring import KINDS, tailor
 
 NEAREST = 0.003
 # Share of vertices inside the body above which a garment may be misplaced [1].

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from ..errors import PhysXNetError
 from ._garment import FABRICS, TEMPLATES, Garment, Template
-from .tailor import KINDS, MEASURES
+from .tailoring import KINDS, MEASURES
 
 _OPTIONS = re.compile(r"^(?P<name>.+?):(?P<options>\w+=[^:,=]*(?:,\w+=[^:,=]*)*)$")
 

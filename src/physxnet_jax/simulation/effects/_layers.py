@@ -15,7 +15,17 @@ from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, Prepared
 from ._limbs import adjoining, limb_labels
-from ._pairs import ClothContact, Facing, Pairs, closest_of, foot_of, rows_of, side_normal
+from ._pairs import (
+    ClothContact,
+    Facing,
+    Pairs,
+    closest_of,
+    foot_of,
+    rows_of,
+    side_normal,
+    smooth_normals,
+    towards,
+)
 
 # Vertices farther than this from the other garment at rest never touch it [m].
 _REACH = 0.25
@@ -33,7 +43,8 @@ class LayerContact(Effect):
 
     Each vertex tracks the closest point of the other garment as `BodyContact` tracks the
     skin: the search starts at the previous result and walks over the surface. The order
-    is known, so a vertex on the wrong side is moved back instead of being kept there.
+    is known, so a vertex on the wrong side is moved back instead of being kept there, unless
+    the layers face each other, as folds do.
     Vertices of the outer garment are tested against triangles of the inner one, and
     vertices of the inner one against triangles of the outer one.
 
@@ -69,20 +80,21 @@ class LayerContact(Effect):
         ring = np.zeros((len(x), self.ring), np.int32)
         patch = np.zeros((len(x), self.patch), np.int32)
         rim = np.zeros(len(x))
-        outwards = np.ones(len(parts) - 1)
         skin = assembly.rest_body[:NUM_BODY_VERTICES]
-        for g, (i, j) in enumerate(zip(parts, parts[1:])):
+        outwards = assembly.faces.copy()
+        for i, j in zip(parts, parts[1:]):
             own = np.flatnonzero(((assembly.faces >= i) & (assembly.faces < j)).all(axis=1))
             f = assembly.faces[own]
             ring[i:j] = i + _nearest(x[i:j], x[i:j], self.ring)
             patch[i:j] = own[_nearest(x[f].mean(axis=1), x[i:j], self.patch)]
             edges = mesh_edges(f)
             rim[edges.vertices[edges.count == 1]] = 1.0
-            # Orientation of the garment's triangles: outwards is away from the skin.
             n = np.cross(x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]])
             middle = x[f].mean(axis=1)
             away = middle - skin[KDTree(skin).query(middle)[1]]
-            outwards[g] = 1.0 if np.einsum("ij,ij->", n, away) >= 0 else -1.0
+            # Outwards is away from the skin.
+            if np.einsum("ij,ij->", n, away) < 0:
+                outwards[own] = f[:, ::-1]
         rows, start, side = [], [], []
         for a in range(len(parts) - 1):
             for b in range(len(parts) - 1):
@@ -94,7 +106,7 @@ class LayerContact(Effect):
                 own_vertices, near = own_vertices[in_reach], near[in_reach]
                 rows.append(own_vertices)
                 start.append(near)
-                side.append(np.full(len(own_vertices), outwards[b] * (1.0 if a > b else -1.0)))
+                side.append(np.full(len(own_vertices), 1.0 if a > b else -1.0))
         if not rows:
             rows, start, side = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
         return _Layers(
@@ -103,7 +115,7 @@ class LayerContact(Effect):
             float32(np.concatenate(side)[:, None, None]),
             jnp.asarray(ring),
             jnp.asarray(patch),
-            jnp.asarray(assembly.faces.astype(np.int32)),
+            jnp.asarray(outwards.astype(np.int32)),
             float32(rim),
             jnp.asarray(label.astype(np.int32)),
             jnp.asarray(adjoining()),
@@ -150,10 +162,20 @@ class _Layers(ClothContact):
             at = jnp.take_along_axis(ring, best[..., None], axis=2)[..., 0]
         corners, weights = closest_of(x, points, self.faces[self.patch[at]])
         foot = foot_of(x, corners, weights)
-        n = self.side * side_normal(x, corners)
         offset = points - foot
+        flat = side_normal(x, corners)
+        beside = offset - jnp.sum(offset * flat, axis=1, keepdims=True) * flat
+        # On edges a triangle's own normal can have the wrong sign; the mean of its
+        # neighbours' can't.
+        normals = smooth_normals(x, self.faces)
+        outwards = foot_of(normals, corners, weights)
+        n = self.side * towards(offset, outwards)
         height = jnp.sum(offset * n, axis=1, keepdims=True)
-        beside = offset - height * n
+        # Layers that face each other belong to different folds, whose order isn't known: they
+        # stay on the side that they are on.
+        facing = jnp.sum(outwards * normals[self.rows], axis=1, keepdims=True) < 0
+        turn = jnp.where(facing & (height < 0), -1.0, 1.0).astype(base.dtype)
+        n, height = turn * n, turn * height
         edge = jnp.sum(weights * (1.0 - self.rim[corners]), axis=0)[:, None] < 1e-3
         past = edge & (jnp.sum(beside * beside, axis=1, keepdims=True) > _BORDER_TOLERANCE**2)
         close = self.adjoining[self.label[self.rows][:, None], self.label[at]][:, None]

@@ -10,6 +10,9 @@ from ...geometry import closest_barycentric
 from ...typing import pytree
 from .._effect import Clock, Prepared, Step
 
+# Pairs that are too close approach their gap within this time [s].
+_SETTLING = 0.1
+
 
 @pytree
 @dataclasses.dataclass(frozen=True)
@@ -142,9 +145,10 @@ def separate_pairs(
 ) -> Array:
     """Displacements [m] after the separation of vertices and triangles.
 
-    Pairs that are too close at the start of the contact interval separate no faster than
-    ``leave`` [m/s], so that tangled cloth comes apart without bursting. All pairs act at once, and
-    each vertex takes the mean of its corrections, so their order doesn't matter.
+    Pairs that are too close at the start of the contact interval separate within a tenth of a
+    second, no faster than ``leave`` [m/s], so that tangled cloth comes apart without bursting. All
+    pairs act at once, so their order doesn't matter. Where several share a vertex, each takes its
+    part; momentum is conserved, as all four vertices of a pair take the same part.
 
     Args:
         displacement: Displacement since the start of the contact interval [m].
@@ -161,7 +165,8 @@ def separate_pairs(
     n = pairs.normal
     relative = pairs.motion(displacement)
     height = pairs.heights(displacement)
-    target = jnp.minimum(law.gap, pairs.height + law.leave * progress * clock.length)
+    speed = jnp.clip((law.gap - pairs.height) / _SETTLING, 0.0, law.leave)
+    target = jnp.minimum(law.gap, pairs.height + speed * progress * clock.length)
     depth = jnp.maximum(target - height, 0.0) * pairs.active
     inertia = sum(s[:, None] ** 2 * w for s, w in zip(share, mass, strict=True))
     lift = depth / (inertia + 1e-9)
@@ -173,11 +178,15 @@ def separate_pairs(
     total = jnp.zeros_like(displacement)
     count = jnp.zeros_like(displacement[:, :1])
     acts = (depth > 0).astype(displacement.dtype)
-    for i, s, w in zip(index, share, mass, strict=True):
-        part = jnp.moveaxis(s[:, None] * w * move, 1, 2)
-        total = total.at[i, :, lane].add(part)
+    for i, s in zip(index, share, strict=True):
         count = count.at[i, 0, lane].add((jnp.abs(s)[:, None] * acts)[:, 0])
-    return displacement + total / jnp.maximum(count, 1.0)
+    most = jnp.ones_like(pairs.height[:, 0])
+    for i in index:
+        most = jnp.maximum(most, count[i, 0, lane])
+    move = move / most[:, None]
+    for i, s, w in zip(index, share, mass, strict=True):
+        total = total.at[i, :, lane].add(jnp.moveaxis(s[:, None] * w * move, 1, 2))
+    return displacement + total
 
 
 def side_normal(x: Float[Array, "vertices 3 batch"], corners: Int[Array, "3 pairs batch"]) -> Array:
@@ -185,3 +194,26 @@ def side_normal(x: Float[Array, "vertices 3 batch"], corners: Int[Array, "3 pair
     a, b, c = (rows_of(x, i) for i in corners)
     n = jnp.cross(b - a, c - a, axis=1)
     return n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-20)
+
+
+def smooth_normals(
+    x: Float[Array, "vertices 3 batch"], faces: Int[Array, "faces 3"]
+) -> Float[Array, "vertices 3 batch"]:
+    """Unit normals of vertices, weighted by the areas of their triangles."""
+    a, b, c = (x[faces[:, i]] for i in range(3))
+    n = jnp.repeat(jnp.cross(b - a, c - a, axis=1), 3, axis=0)
+    n = jnp.zeros_like(x).at[faces.reshape(-1)].add(n)
+    return n / jnp.sqrt(jnp.sum(n * n, axis=1, keepdims=True) + 1e-20)
+
+
+def towards(
+    offset: Float[Array, "pairs 3 batch"], outwards: Float[Array, "pairs 3 batch"]
+) -> Float[Array, "pairs 3 batch"]:
+    """Unit directions of offsets from a surface, turned to its outer side.
+
+    Where a point lies on the surface, the direction is the surface's normal ``outwards``.
+    """
+    length = jnp.sqrt(jnp.sum(offset * offset, axis=1, keepdims=True) + 1e-18)
+    side = jnp.where(jnp.sum(offset * outwards, axis=1, keepdims=True) < 0, -1.0, 1.0)
+    outwards = outwards / jnp.sqrt(jnp.sum(outwards * outwards, axis=1, keepdims=True) + 1e-20)
+    return jnp.where(length > 1e-5, side.astype(offset.dtype) * offset / length, outwards)

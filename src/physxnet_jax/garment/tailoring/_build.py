@@ -7,7 +7,7 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from ...body import Body
-from ...geometry import boundary_loops, cast_rays, closest_points, make_mesh, vertex_normals
+from ...geometry import boundary_loops, closest_points, make_mesh, vertex_normals
 from .._cut import cut, split_quads
 from ._flatten import flatten, nearest_triangle
 from ._grid import BEYOND, SPACING, extension, neighbour_mean
@@ -20,8 +20,10 @@ _ANKLE = -0.77
 # Above this height the middle of front and back is straight on the pattern [m].
 _STRAIGHT = 0.0
 # Passes that smooth the seam, the carrier, and the share of the limbs.
-_SEAM_PASSES, CARRIER_PASSES, _SHARE_PASSES = 60, 10, 6
+_SEAM_PASSES, CARRIER_PASSES, _SHARE_PASSES, _LEAST_PASSES = 60, 10, 6, 3
 _FARTHEST = 0.25
+# Closer vertices of the surface only show how it is meshed [m].
+_NEAREST = 0.015
 
 
 def build_charts(body: Body) -> dict[str, np.ndarray]:
@@ -133,6 +135,9 @@ def _fields(
     turn = turn**2 * (3 - 2 * turn)
     reach = (1 - turn) * upright + turn * np.where(share > 0.3, mixed, straight)
     free = _free_distance(carrier, faces)
+    # Smoothing must not raise the least.
+    for _ in range(_LEAST_PASSES):
+        free = _least_around(free, mean)
     out = np.column_stack([carrier[:, 1], reach, share, free])
     for _ in range(_SHARE_PASSES):
         out[:, 1:] = mean @ out[:, 1:]
@@ -140,11 +145,31 @@ def _fields(
 
 
 def _free_distance(carrier: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, " vertices"]:
-    """Distance to the surface itself along its outward normals [m]."""
-    mesh = make_mesh(carrier, faces)
-    normals = vertex_normals(mesh.vertices, mesh.faces)
-    hits = cast_rays(mesh, mesh.vertices + 0.004 * normals, normals, max_distance=_FARTHEST)
-    return np.where(np.asarray(hits.valid), np.asarray(hits.distance) + 0.004, _FARTHEST)
+    """How far the surface can be moved outwards before it meets itself [m].
+
+    The radius of the largest ball that touches a vertex from outside and holds no other.
+
+    References:
+        Ma, Bae and Choi, 3D medial axis point approximation using nearest neighbors and the normal
+        field (2012).
+    """
+    normals = np.asarray(vertex_normals(jnp.asarray(carrier, jnp.float32), jnp.asarray(faces)))
+    out = np.empty(len(carrier))
+    for i, (p, n) in enumerate(zip(carrier, normals)):
+        away = carrier - p
+        squared = (away**2).sum(axis=1)
+        ahead = away @ n
+        other = (squared > _NEAREST**2) & (ahead > 1e-6)
+        out[i] = (squared[other] / (2 * ahead[other])).min(initial=_FARTHEST)
+    return out
+
+
+def _least_around(values: Float[np.ndarray, " vertices"], mean: sp.csr_matrix) -> np.ndarray:
+    """The least value of each vertex and its neighbours."""
+    pairs = mean.tocoo()
+    out = values.copy()
+    np.minimum.at(out, pairs.row, values[pairs.col])
+    return out
 
 
 def _grid(

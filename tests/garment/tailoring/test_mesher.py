@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 from physxnet_jax.errors import MeshError
-from physxnet_jax.garment.tailor._flatten import flatten, nearest_triangle
-from physxnet_jax.garment.tailor._mesher import (
+from physxnet_jax.garment.tailoring._flatten import flatten, nearest_triangle
+from physxnet_jax.garment.tailoring._mesher import (
     distance_to_polygon,
     mesh_polygon,
     points_in_polygon,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from physxnet_jax.garment import clearance
-from physxnet_jax.garment.tailor import build_charts
-from physxnet_jax.garment.tailor._charts import (
+from physxnet_jax.garment.tailoring import build_charts
+from physxnet_jax.garment.tailoring._charts import (
     CHARTS,
     HEIGHT,
     carrier,
@@ -15,14 +15,14 @@ from physxnet_jax.garment.tailor._charts import (
     load_charts,
     place_table,
 )
-from physxnet_jax.garment.tailor._curves import (
+from physxnet_jax.garment.tailoring._curves import (
     centre_point,
     level_curve,
     rings,
     seam_points,
     seam_row,
 )
-from physxnet_jax.garment.tailor._grid import SPACING, extension, spline
+from physxnet_jax.garment.tailoring._grid import SPACING, extension, spline
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,14 @@ import trimesh
 
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import KINDS, clearance, cut_vertices, tailor
-from physxnet_jax.garment.tailor._charts import load_charts
-from physxnet_jax.geometry import boundary_loops, manifold_report, mesh_edges, vertex_normals
+from physxnet_jax.garment.tailoring._charts import load_charts
+from physxnet_jax.geometry import (
+    boundary_loops,
+    manifold_report,
+    mesh_edges,
+    self_intersections,
+    vertex_normals,
+)
 
 QUICK = ("shorts", "skirt")
 OPENINGS = {"top": 4, "strapless": 2, "trousers": 3, "skirt": 2, "dress": 4, "strapless-dress": 2}
@@ -114,6 +120,21 @@ def test_ease_is_what_the_garment_is_wider_than_the_body(body, ease):
             charts.tapes[tape].length(rest)
         )
         assert found == pytest.approx(ease, abs=0.012), name
+
+
+@pytest.mark.parametrize("name", every_kind())
+def test_no_garment_crosses_itself_at_rest(name):
+    ranges = KINDS[name].ranges
+    for ease in (ranges["ease"].low, ranges["ease"].default, ranges["ease"].high):
+        for flare in (ranges["flare"].default, ranges["flare"].high):
+            assert not len(self_intersections(*arrays(tailor(name, ease=ease, flare=flare))))
+
+
+def test_a_crossing_at_rest_would_be_found():
+    v, f = arrays(tailor("shorts"))
+    # The left leg moved into the right one.
+    v[v[:, 0] > 0.02, 0] -= 0.08
+    assert len(self_intersections(v, f))
 
 
 def test_length_runs_down_to_the_hem_and_flare_widens_it():
@@ -239,8 +260,8 @@ def test_a_traced_length_needs_a_mesh():
 
 @pytest.mark.release
 def test_stored_patterns_are_those_that_are_drawn():
-    from physxnet_jax.garment.tailor import draw_usual_pattern
-    from physxnet_jax.garment.tailor._pattern import pattern_arrays, stored_pattern
+    from physxnet_jax.garment.tailoring import draw_usual_pattern
+    from physxnet_jax.garment.tailoring._pattern import pattern_arrays, stored_pattern
 
     drawn = draw_usual_pattern("shorts")
     stored = pattern_arrays("shorts", stored_pattern("shorts"))

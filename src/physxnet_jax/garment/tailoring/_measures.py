@@ -36,7 +36,6 @@ class Kind:
         back: Depth of the neckline behind [m].
         round: Exponent of the neckline: 1 is a V, 2 an ellipse, more is square.
         elastic: Borders held by elastic.
-        over: Room that is left for another garment below it [m].
     """
 
     style: Style
@@ -52,7 +51,6 @@ class Kind:
     back: float = 0.02
     round: float = 2.0
     elastic: tuple[str, ...] = ()
-    over: float = 0.0
 
 
 def _range(default: float, low: float, high: float) -> Range:
@@ -131,7 +129,7 @@ KINDS: dict[str, Kind] = {
         style="top",
         summary="wide top with half sleeves",
         ranges=_top(
-            (0.26, 0.12, 0.50),
+            (0.26, 0.12, 0.40),
             (0.57, 0.40, 0.60),
             (0.28, 0.12, 0.46),
             (0.12, 0.04, 0.20),
@@ -140,7 +138,6 @@ KINDS: dict[str, Kind] = {
         classes=_TOP_CLASSES,
         sleeve_ease=0.7,
         neck=0.06,
-        over=0.008,
     ),
     "strapless": Kind(
         style="strapless",
@@ -154,15 +151,15 @@ KINDS: dict[str, Kind] = {
         elastic=("top",),
     ),
     "slim": _trousers(
-        "slim trousers", (0.05, 0.045, 0.09), _LONG, (0.0, -0.03, 0.15), fabric="denim", hem=0.6
+        "slim trousers", (0.055, 0.05, 0.09), _LONG, (0.0, -0.03, 0.15), fabric="denim", hem=0.6
     ),
     "trousers": _trousers(
-        "straight trousers", (0.06, 0.03, 0.16), _LONG, (0.0, -0.06, 0.30), hem=0.8
+        "straight trousers", (0.06, 0.05, 0.16), _LONG, (0.0, -0.06, 0.30), hem=0.8
     ),
     "wide": _trousers("wide trousers", (0.14, 0.08, 0.26), _LONG, (0.06, 0.0, 0.30), hip_ease=0.8),
     "shorts": _trousers(
         "shorts",
-        (0.10, 0.03, 0.24),
+        (0.10, 0.05, 0.24),
         (0.42, 0.36, 0.60),
         (0.0, -0.02, 0.30),
         ends=(0.48, 0.60),

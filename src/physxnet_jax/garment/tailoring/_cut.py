@@ -162,9 +162,9 @@ def _fitted(name: str, measures, rest, surface: Carrier, hem):
     return make_form(kind_of(name), measures, rest, surface, load_charts(), hem).off
 
 
-@functools.partial(jax.jit, static_argnames=("chart", "over"))
-def _placed(surface: Carrier, off, uv, chart: ChartName, over: float):
-    return place(Form(surface, off, over), load_charts(), chart, uv)[0]
+@functools.partial(jax.jit, static_argnames="chart")
+def _placed(surface: Carrier, off, uv, chart: ChartName):
+    return place(Form(surface, off), load_charts(), chart, uv)[0]
 
 
 @functools.partial(jax.jit, static_argnames="name")
@@ -199,14 +199,13 @@ def draw_class(name: str, ends: tuple[tuple[str, float, float], ...]) -> Pattern
                 triples.setdefault(level, []).append(float(value))
         middle = measures | {k: jnp.asarray(v[1], jnp.float32) for k, v in limits.items()}
         hem = jnp.asarray(triples["hem"][1], jnp.float32)
-        form = Form(surface, _fitted(name, middle, rest, surface, hem), kind.over)
+        form = Form(surface, _fitted(name, middle, rest, surface, hem))
 
         def at(chart: ChartName, uv: np.ndarray) -> np.ndarray:
             size = -(-len(uv) // _POINTS) * _POINTS
             padded = np.resize(uv, (size, 2)).astype(np.float32)
             points = [
-                _placed(form.carrier, form.off, p, chart, kind.over)
-                for p in padded.reshape(-1, _POINTS, 2)
+                _placed(form.carrier, form.off, p, chart) for p in padded.reshape(-1, _POINTS, 2)
             ]
             return np.concatenate([np.asarray(p, np.float64) for p in points])[: len(uv)]
 

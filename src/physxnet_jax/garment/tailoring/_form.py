@@ -13,14 +13,16 @@ from ._curves import rings
 from ._grid import spline
 from ._measures import Kind
 
-# Cloth takes at most this share of the room before the next limb.
-_ROOM = 0.42
+# Cloth takes at most this share of the distance at which it would meet that of the next limb.
+_ROOM = 0.8
 # A garment fades from the chest's width to the shoulders' between these heights [m].
 _FADE = (0.37, 0.50)
 # Trunk and legs are blended between these heights [m].
 _CROTCH = (-0.14, -0.06)
 # How much tighter than the clearance cloth may lie: half of it around the body [m].
 _TIGHT = -0.025
+# How round the positive part of a length is [m].
+_SMOOTH = 0.002
 # Two lengths are blended by a maximum that is this round [m].
 _ROUND = 0.01
 WAIST = {"trousers": 0.10, "skirt": 0.16, "dress": 0.20, "strapless-dress": 0.20}
@@ -31,7 +33,7 @@ _WAIST_EASE = {"trousers": 0.012, "skirt": 0.012, "dress": 0.05, "strapless-dres
 _SNUG = 0.05
 _ANKLE = -0.73
 # A ring's length grows by 2 pi times what it is moved outwards, but for its hollows: a few steps.
-STEPS = 4
+STEPS = 10
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,12 +43,10 @@ class Form:
     Attributes:
         carrier: The body's smooth surface.
         off: How far cloth stands off it at each ring of trunk, legs, arms and skirt [m].
-        over: Room that is left for another garment below [m].
     """
 
     carrier: Carrier
     off: Mapping[str, Float[Array, " rings"]]
-    over: float = 0.0
 
 
 def place(
@@ -62,7 +62,17 @@ def place(
         _stand(form, name == "skirt", index + charts.start(name, side), weight, fields)
         for side in (False, True)
     )
-    return left, right
+    return _on_its_side(left, 1.0), _on_its_side(right, -1.0)
+
+
+def _on_its_side(points: Float[Array, "points 3"], sign: float) -> Float[Array, "points 3"]:
+    """Keeps points of one half from crossing the middle."""
+    return points.at[:, 0].set(sign * _above_zero(sign * points[:, 0]))
+
+
+def _above_zero(x: Array) -> Array:
+    """A smooth, positive approximation of the positive part of lengths."""
+    return 0.5 * (x + jnp.sqrt(x**2 + _SMOOTH**2))
 
 
 def ring_points(form: Form, part: str) -> Float[Array, "rings pieces points 3"]:
@@ -78,9 +88,10 @@ def _stand(form: Form, skirt: bool, nodes: Array, weights: Array, fields: Array)
     n = values[:, 3:6]
     n = n / jnp.linalg.norm(n, axis=1, keepdims=True)
     off = _off(form, skirt, fields)
-    room = _ROOM * fields[:, FREE]
+    clear = values[:, 6]
+    room = _above_zero(_ROOM * fields[:, FREE] - clear)
     off = room * jnp.tanh(off / room)
-    return values[:, :3] + (values[:, 6] + form.over + off)[:, None] * n
+    return values[:, :3] + (clear + off)[:, None] * n
 
 
 def _off(form: Form, skirt: bool, fields: Float[Array, "points 4"]) -> Float[Array, " points"]:
@@ -138,16 +149,15 @@ def make_form(
         hem: Height of the hem on the default shape [m].
     """
     off = {p: jnp.zeros(len(rings(p).levels)) for p in ("torso", "leg", "arm", "skirt")}
-    form = Form(surface, off, kind.over)
+    form = Form(surface, off)
     tape = {k: t.length(rest) for k, t in charts.tapes.items()}
     level = {k: t.level for k, t in charts.tapes.items()}
     wanted = _wanted(kind, measures, tape, level, form, hem)
     for part, goal in wanted.items():
         bare = perimeters(form, part)
         goal = _wider(goal, bare + _TIGHT)
-
-        off = off | {part: _fit_rings(Form(surface, off, kind.over), part, goal)}
-    return Form(surface, off, kind.over)
+        off = off | {part: _fit_rings(Form(surface, off), part, goal)}
+    return Form(surface, off)
 
 
 def _fit_rings(form: Form, part: str, goal: Float[Array, " rings"]) -> Float[Array, " rings"]:
