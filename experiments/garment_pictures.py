@@ -1,10 +1,11 @@
-"""Draws the tailor's garments: every kind, one dress by ease and length, fabrics, outfits.
+"""Draws the tailor's garments: every kind, one dress by ease and length, fabrics, outfits, methods.
 
-Command: python experiments/garment_pictures.py [kinds] [measures] [fabrics] [outfit]
+Command: python experiments/garment_pictures.py [kinds] [measures] [fabrics] [outfit] [look]
          (all by default); salsa needs $PHYSXNET_DATA or ../shared, else its column shows spin
 Cost:    half a minute a garment on two cores.
 Result:  docs/garments.png (front and back, at rest and in three poses), docs/measures.png,
-         docs/fabrics.png, docs/outfit.png.
+         docs/fabrics.png, docs/outfit.png, docs/look.png (shirt and trousers by the network, by
+         skinning, and simulated at three accuracies).
 """
 
 import argparse
@@ -16,6 +17,7 @@ import jax
 import numpy as np
 from rich.progress import track
 
+from physxnet_jax import Simulation, dress
 from physxnet_jax.body import load_body
 from physxnet_jax.garment import KINDS, Garment, tailor
 from physxnet_jax.motion import Motion, body_animation, load_motion
@@ -39,8 +41,8 @@ def worn(garments: tuple[Garment, ...], motion: Motion) -> tuple[np.ndarray, ...
     return simulate_batch(scene, [motion])[0].positions
 
 
-def person(garments, positions, skin, faces, turn, size):
-    """One view of a dressed person as an image; ``turn`` is the camera's direction."""
+def person(garments, positions, skin, faces, turn, size, close=False):
+    """One view of a dressed person, or close up of the clothes; ``turn`` is where the camera is."""
     import pyvista as pv
 
     def surface(v, f):
@@ -53,18 +55,19 @@ def person(garments, positions, skin, faces, turn, size):
         cloth = surface(x, np.asarray(g.mesh.faces))
         cloth = cloth.compute_normals(split_vertices=False, auto_orient_normals=False)
         plotter.add_mesh(cloth, color=COLOURS[k % len(COLOURS)], smooth_shading=True)
-    middle = 0.5 * (skin.min(axis=0) + skin.max(axis=0))
+    shown = np.concatenate(positions) if close else skin
+    middle = 0.5 * (shown.min(axis=0) + shown.max(axis=0))
     plotter.camera.parallel_projection = True
     plotter.camera.focal_point = middle
     plotter.camera.position = middle + 3.0 * turn + np.array([0, 0.15, 0])
     plotter.camera.up = (0, 1, 0)
-    plotter.camera.parallel_scale = 0.9
+    plotter.camera.parallel_scale = 0.6 if close else 0.9
     image = np.asarray(plotter.screenshot(return_img=True))[..., :3]
     plotter.close()
     return image
 
 
-def views(garments, motion, positions, frame, size):
+def views(garments, motion, positions, frame, size, close=False):
     """Front and back of a frame, side by side."""
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
@@ -77,7 +80,9 @@ def views(garments, motion, positions, frame, size):
     ahead = ahead * [1, 0, 1] / np.linalg.norm(ahead * [1, 0, 1])
     faces = np.asarray(body.rest_mesh().faces)
     x = [p[frame] for p in positions]
-    return np.hstack([person(garments, x, skin, faces, s * ahead, size) for s in (1.0, -1.0)])
+    return np.hstack(
+        [person(garments, x, skin, faces, s * ahead, size, close) for s in (1.0, -1.0)]
+    )
 
 
 def at_rest(garments, size):
@@ -140,11 +145,11 @@ def measures() -> None:
 
 def fabrics() -> None:
     """Silk, denim and jersey on one A-line dress."""
-    motion, out = clip("spin", 60), []
+    motion, out = clip("spin", 90), []
     for name in ("silk", "denim", "jersey"):
         g = (tailor("aline", flare=0.8, fabric=name),)
         x = worn(g, motion)
-        parts = [views(g, motion, x, f, (300, 560)) for f in (20, 50)]
+        parts = [views(g, motion, x, f, (340, 460), close=True) for f in (60, 85)]
         out.append(titled(np.vstack(parts), name))
     save("fabrics.png", grid(out, 3))
 
@@ -161,8 +166,33 @@ def outfit() -> None:
     save("outfit.png", grid(out, 3))
 
 
+def look() -> None:
+    """Shirt over trousers on one motion, by every method, one row each."""
+    garments = (tailor("trousers"), tailor("shirt"))
+    motion, frames, out = clip("salsa", 60), (20, 40, 59), []
+    for method, accuracy in (
+        ("network", None),
+        ("lbs", None),
+        ("simulate", "draft"),
+        ("simulate", "standard"),
+        ("simulate", "reference"),
+    ):
+        simulation = None if accuracy is None else Simulation(accuracy=accuracy)
+        made = dress(motion, garments, method=method, simulation=simulation, include_body=False)
+        x = tuple(np.asarray(m.positions) for m in made.meshes)
+        parts = [views(garments, motion, x, f, (220, 420)) for f in frames]
+        out.append(titled(np.hstack(parts), f"{method}, {accuracy}" if accuracy else method))
+    save("look.png", np.vstack(out))
+
+
 def main() -> None:
-    sheets = {"kinds": kinds, "measures": measures, "fabrics": fabrics, "outfit": outfit}
+    sheets = {
+        "kinds": kinds,
+        "measures": measures,
+        "fabrics": fabrics,
+        "outfit": outfit,
+        "look": look,
+    }
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sheets", nargs="*", default=[])
     for name in parser.parse_args().sheets or sheets:

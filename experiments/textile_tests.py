@@ -37,7 +37,7 @@ def main() -> None:
                 "band": [low, high],
                 "in_band": bool(low <= coarse.coefficient <= high),
                 "source": source,
-                "folds": fine.folds,
+                "folds": [coarse.folds, fine.folds],
                 "last_speed_m_s": fine.speed,
                 **{f"cantilever_{k}": v for k, v in dataclasses.asdict(strip).items()},
             }
@@ -45,16 +45,16 @@ def main() -> None:
     with atomic_write(RESULTS / "textile.json") as part:
         part.write_text(json.dumps({"rows": rows}, indent=1) + "\n")
     lines = [
-        "| fabric | drape % (10 mm mesh) | (7 mm) | published | folds | bending length mm |"
-        " measured mm |",
-        "|---|---|---|---|---|---|---|",
+        "| fabric | drape % (10 mm mesh) | (7 mm) | published | folds | (7 mm) |"
+        " bending length mm | measured mm |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         low, high = r["band"]
         lines.append(
             f"| {r['fabric']} | {r['drape_percent']:.1f} | {r['drape_fine_percent']:.1f} |"
-            f" {low:.0f} to {high:.0f} | {r['folds']} | {1e3 * r['cantilever_length']:.1f} |"
-            f" {1e3 * r['cantilever_measured']:.1f} |"
+            f" {low:.0f} to {high:.0f} | {r['folds'][0]} | {r['folds'][1]} |"
+            f" {1e3 * r['cantilever_length']:.1f} | {1e3 * r['cantilever_measured']:.1f} |"
         )
     with atomic_write(RESULTS / "textile.md") as part:
         part.write_text("\n".join(lines) + "\n")

@@ -11,14 +11,16 @@ from physxnet_jax.garment import FABRICS
 EDGE = 0.011
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("name", sorted(FABRICS))
-def test_drape_coefficient_is_in_its_published_range(name):
-    low, high, _ = DRAPE_BANDS[name]
-    drape = drape_test(FABRICS[name], edge=EDGE, seconds=4.0)
-    assert low <= drape.coefficient <= high
-    assert drape.folds >= 3, "a disc that bends in one direction only isn't cloth"
-    assert drape.speed < 0.3, "nearly at rest"
+@pytest.mark.release
+def test_drape_coefficients_are_in_their_published_ranges():
+    drapes = {name: drape_test(fabric) for name, fabric in FABRICS.items()}
+    for name, drape in drapes.items():
+        low, high, _ = DRAPE_BANDS[name]
+        assert low <= drape.coefficient <= high, name
+        assert drape.folds >= 3, "a disc that bends in one direction only isn't cloth"
+        assert drape.speed < 0.3, "nearly at rest"
+    # The cloth decides the number of folds, not the mesh; limp cloth has more than stiff cloth.
+    assert drapes["denim"].folds < drapes["silk"].folds
 
 
 @pytest.mark.nightly
@@ -32,8 +34,8 @@ def test_stiff_fabric_stays_flat_and_limp_fabric_hangs_down():
 
 @pytest.mark.release
 def test_cantilever_measures_the_bending_length():
-    cotton = cantilever_test(FABRICS["cotton"], cells=12)
-    assert cotton.measured == pytest.approx(cotton.length, rel=0.1)
+    cotton = cantilever_test(FABRICS["cotton"], cells=16)
+    assert cotton.measured == pytest.approx(cotton.length, rel=0.05)
     # A strip eight times as stiff has twice the bending length, not the same.
     stiff = dataclasses.replace(FABRICS["cotton"], bend=8 * FABRICS["cotton"].bend)
-    assert cantilever_test(stiff, cells=12).measured == pytest.approx(2 * cotton.measured, rel=0.1)
+    assert cantilever_test(stiff, cells=16).measured == pytest.approx(2 * cotton.measured, rel=0.05)

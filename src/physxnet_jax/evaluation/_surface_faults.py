@@ -1,6 +1,7 @@
 """What one sees at a glance: skin through cloth, and cloth through itself."""
 
 import dataclasses
+import functools
 import itertools
 
 import jax.numpy as jnp
@@ -104,7 +105,21 @@ def _covered_faces(
     outer_faces: Int[np.ndarray, "triangles 3"],
 ) -> Bool[np.ndarray, " faces"]:
     """Triangles of skin, or of a garment, with cloth over them at rest."""
-    x = jnp.asarray(inner, jnp.float32)
+    floats = (np.asarray(a, np.float32).tobytes() for a in (inner, outer))
+    integers = (np.asarray(a, np.int32).tobytes() for a in (faces, outer_faces))
+    return _found_cover(*floats, *integers)
+
+
+# Every motion of a scene has the same.
+@functools.lru_cache(maxsize=8)
+def _found_cover(
+    inner_bytes: bytes, outer_bytes: bytes, faces_bytes: bytes, outer_faces_bytes: bytes
+) -> Bool[np.ndarray, " faces"]:
+    inner, outer = (np.frombuffer(b, np.float32).reshape(-1, 3) for b in (inner_bytes, outer_bytes))
+    faces, outer_faces = (
+        np.frombuffer(b, np.int32).reshape(-1, 3) for b in (faces_bytes, outer_faces_bytes)
+    )
+    x = jnp.asarray(inner)
     normals = vertex_normals(x, jnp.asarray(faces))
     mesh = make_mesh(outer, outer_faces)
     over, open_ = np.zeros(len(x), bool), np.ones(len(x), bool)
@@ -121,5 +136,6 @@ def _covered_faces(
         over |= open_ & leaves
         gone = np.where(open_, gone + np.asarray(hits.distance) + _PAST, gone)
         open_ &= gone < _COVER
-    covered: Bool[np.ndarray, "faces 3"] = over[faces]
-    return np.logical_or.reduce(covered, axis=1)
+    covered = np.asarray(over[faces].any(axis=1))
+    covered.flags.writeable = False
+    return covered

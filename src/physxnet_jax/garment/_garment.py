@@ -45,6 +45,11 @@ class Fabric:
         check_numbers(self, "bend", "thickness", "friction", zero=True)
 
     @property
+    def is_directional(self) -> bool:
+        """Whether warp, weft or shear have stiffnesses of their own."""
+        return (self.warp, self.weft, self.shear) != (None, None, None)
+
+    @property
     def membrane(self) -> tuple[float, float, float]:
         """Stiffness along warp, weft and in shear [N/m]."""
         return (

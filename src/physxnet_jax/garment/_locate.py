@@ -13,8 +13,14 @@ from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body, load_body, t_pose
 from ..errors import MeshError
-from ..geometry import TriMesh, closest_among, nearby_faces, padded_rows, vertex_normals
-from ._fit import smoothing_matrix
+from ..geometry import (
+    TriMesh,
+    closest_among,
+    nearby_faces,
+    padded_rows,
+    smoothing_matrix,
+    vertex_normals,
+)
 from ._garment import carried_weights
 
 UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}

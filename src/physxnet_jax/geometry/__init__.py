@@ -52,6 +52,7 @@ from ._topology import (
     hinges as hinges,
     manifold_report as manifold_report,
     mesh_edges as mesh_edges,
+    smoothing_matrix as smoothing_matrix,
     vertex_faces as vertex_faces,
 )
 from ._visible_skin import VisibleSkin as VisibleSkin, visible_skin as visible_skin

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Bool, Int
 
 
@@ -199,3 +200,14 @@ def manifold_report(
         ),
         "inconsistent_edges": int(repeated.sum()),
     }
+
+
+def smoothing_matrix(faces: Int[np.ndarray, "faces 3"], num_vertices: int) -> sp.csr_matrix:
+    """A matrix that averages each vertex with the mean of its neighbours, half and half."""
+    e = mesh_edges(faces).vertices
+    ones = np.ones(len(e))
+    graph = sp.csr_matrix((ones, (e[:, 0], e[:, 1])), (num_vertices, num_vertices))
+    graph = graph + graph.T
+    degree = np.maximum(np.asarray(graph.sum(axis=1)).ravel(), 1)
+    eye = sp.identity(num_vertices, format="csr")
+    return sp.csr_matrix(0.5 * eye + 0.5 * sp.diags(1 / degree) @ graph)

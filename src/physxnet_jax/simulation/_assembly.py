@@ -54,8 +54,8 @@ class Assembly:
     holds: tuple[tuple[Int[np.ndarray, " _"], ...], ...]
 
 
-# Friction of elastic bands, which are made to grip [1].
-_GRIP = 0.8
+# Friction of elastic bands, as of silicone on skin [1].
+_GRIP = 1.5
 
 
 def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " shapes"]) -> Assembly:

@@ -64,12 +64,19 @@ STANDARD: tuple[Effect, ...] = (
 
 
 def standard_effects(garments: Sequence[Garment]) -> tuple[Effect, ...]:
-    """`STANDARD`, with `LayerContact` between several garments and `Elastic` where one has it."""
+    """`STANDARD` and what the garments call for.
+
+    `Membrane` in place of `Stretch` where a fabric has stiffnesses of its own along warp, weft or
+    in shear, at about twice the time; `Elastic` where a garment has a band; `LayerContact` between
+    several garments.
+    """
     more: list[Effect] = [Elastic()] if any(g.elastic for g in garments) else []
     if len(garments) > 1:
         more.append(LayerContact())
-    at = [type(e) for e in STANDARD].index(BodyContact)
-    return (*STANDARD[:at], *more, *STANDARD[at:])
+    woven = any(g.fabric.is_directional for g in garments)
+    effects = [Membrane() if woven and isinstance(e, Stretch) else e for e in STANDARD]
+    at = [type(e) for e in effects].index(BodyContact)
+    return (*effects[:at], *more, *effects[at:])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,10 +7,16 @@ from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
 from ...body import Body
-from ...geometry import boundary_loops, closest_points, make_mesh, vertex_normals
+from ...geometry import (
+    boundary_loops,
+    closest_points,
+    make_mesh,
+    smoothing_matrix,
+    vertex_normals,
+)
 from .._cut import cut, split_quads
 from ._flatten import flatten, nearest_triangle
-from ._grid import BEYOND, SPACING, extension, neighbour_mean
+from ._grid import BEYOND, SPACING, extension
 from ._outline import skirt_grid, tapes
 
 # Depth of the side seam of the torso [m]; the spine lies too far back.
@@ -43,7 +49,7 @@ def build_charts(body: Body) -> dict[str, np.ndarray]:
     rest = np.asarray(body.rest_vertices(body.default_shape()), dtype=np.float64)
     rows, faces = split_quads(np.asarray(body.tights_quads), len(rest))
     points = rows @ rest
-    mean = neighbour_mean(faces, len(points))
+    mean = smoothing_matrix(faces, len(points))
     mirror = np.asarray(KDTree(points).query(points * [-1, 1, 1])[1])
     carrier = points
     for _ in range(CARRIER_PASSES):

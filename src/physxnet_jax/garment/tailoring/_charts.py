@@ -12,10 +12,10 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES, load_body
-from ...geometry import vertex_normals
+from ...geometry import smoothing_matrix, vertex_normals
 from .._cut import split_quads
 from ._build import CARRIER_PASSES
-from ._grid import extension, neighbour_mean, spline
+from ._grid import extension, spline
 
 ASSET = "charts_cc0.npz"
 HEIGHT, REACH, ARM, FREE = range(4)
@@ -168,7 +168,7 @@ def _tights() -> dict[str, np.ndarray]:
     quads = np.asarray(body.tights_quads)
     rows, faces = split_quads(quads, len(rest))
     p, skin = rows @ rest, rest[:NUM_BODY_VERTICES]
-    mean = neighbour_mean(faces, len(p)).tocoo()
+    mean = smoothing_matrix(faces, len(p)).tocoo()
     mirrors = (KDTree(x).query(x * [-1, 1, 1])[1] for x in (p, skin))
     mirror, skin_mirror = (np.asarray(m, np.int32) for m in mirrors)
     return {

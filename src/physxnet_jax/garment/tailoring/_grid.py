@@ -3,8 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse as sp
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 
 # Distance between nodes of a chart's grid [m].
 SPACING = 0.015
@@ -80,12 +79,3 @@ def extension(
         layers.append((number[at[:, 0], at[:, 1]], near, far, share))
         known[at[:, 0], at[:, 1]] = True
     return layers
-
-
-def neighbour_mean(faces: Int[np.ndarray, "faces 3"], n: int) -> sp.csr_matrix:
-    """Half of each vertex and half of the mean of its neighbours, as a matrix."""
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    beside = sp.coo_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), (n, n)).tocsr()
-    beside = ((beside + beside.T) > 0).astype(np.float64)
-    count = np.asarray(beside.sum(axis=1)).ravel()
-    return sp.csr_matrix(0.5 * (sp.identity(n) + sp.diags(1 / count) @ beside))
