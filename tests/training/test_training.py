@@ -12,6 +12,7 @@ import pytest
 
 from physxnet_jax.data import Sequence, batch_indices, is_trainable
 from physxnet_jax.data._frames import MAX_OFFSET, load_frames
+from physxnet_jax.devices import make_mesh
 from physxnet_jax.dressing import Inference
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.evaluation import network, skinning
@@ -459,7 +460,7 @@ def test_padding_of_the_last_batch_does_not_affect_validation(monkeypatch):
     # What is handed over only looks like frames and steps.
     validate = inspect.unwrap(_loop._validate)
     monkeypatch.setattr(_loop, "eval_step", lambda problem, *rest: look(*rest))
-    found, _ = validate(SimpleNamespace(config=config), None, range(25))
+    found, _ = validate(SimpleNamespace(config=config), None, range(25), make_mesh(8))
     assert found["validation_mm"] == pytest.approx(errors[::3].mean())
 
 

@@ -115,10 +115,12 @@ class Dataset:
 class Train:
     """Train a network on a dataset.
 
-    An interrupted run resumes if the same command is run again.
+    An interrupted run resumes if the same command is run again, on any number of devices. Processes
+    that Slurm or Open MPI start join by themselves; others are given each other's address.
 
     Examples:
       physxnet train experiments/training.toml#local --data runs/ours --out runs/local
+      physxnet train experiments/training.toml#local --data runs/ours -o runs/a --devices 2
     """
 
     config: tyro.conf.Positional[str]
@@ -131,6 +133,14 @@ class Train:
     """Splits of the datasets to train on."""
     steps: int | None = None
     """Stop after this many steps in total."""
+    devices: int | None = None
+    """Devices of this machine to split batches among; by default as many as divide them."""
+    coordinator: str | None = None
+    """Address of the first of several processes, HOST:PORT."""
+    num_processes: int | None = None
+    """Number of processes."""
+    process_id: int | None = None
+    """This process's number, from 0."""
     name: str | None = None
     """Name of the weights; by default the configuration's table or file name."""
     terminal: QuietTerminal = dataclasses.field(default_factory=QuietTerminal)

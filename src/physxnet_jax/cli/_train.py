@@ -5,6 +5,7 @@ import math
 from rich.console import Console
 
 from ..data import CARD, list_sequences, read_note, read_sequence
+from ..devices import join_processes
 from ..models import save_predictor
 from ..training import TrainConfig, read_metrics, train as run
 from ._configs import config_name, read_config
@@ -17,6 +18,7 @@ _CARD_KEYS = ("engine", "mirror", "speed", "left_out", "upper_from", "exaggerate
 
 def train(command: Train, console: Console) -> int:
     """Starts or resumes training; writes the weights to the run's folder."""
+    first = join_processes(command.coordinator, command.num_processes, command.process_id) == 0
     config = read_config(command.config, TrainConfig)
     sequences = [
         read_sequence(folder)
@@ -28,12 +30,21 @@ def train(command: Train, console: Console) -> int:
 
         def report(done: int, total: int, values: dict[str, float]) -> None:
             progress("steps", done, total)
-            if "validation_mm" in values:
+            if first and "validation_mm" in values:
                 console.print(
                     f"step {done}: validation {values['validation_mm']:.2f} mm", highlight=False
                 )
 
-        predictor = run(config, sequences, command.out, steps=command.steps, report=report)
+        predictor = run(
+            config,
+            sequences,
+            command.out,
+            steps=command.steps,
+            devices=command.devices,
+            report=report,
+        )
+    if not first:
+        return 0
     log = read_metrics(command.out)
     train_sequences = [s for s in sequences if s.name not in config.validation]
     measured = [x for x in log if math.isfinite(x.get("validation_mm", math.nan))]

@@ -13,9 +13,11 @@ import jax
 import numpy as np
 import optax
 from flax import nnx
+from jax.sharding import Mesh
 
 from ..body import load_body
 from ..data import Frames, Sequence, batch_indices, load_frames, mirrored_sequence, take
+from ..devices import at_home, make_mesh, own_rows, repeated, split
 from ..errors import FormatError, PhysXNetError
 from ..files import append_line, atomic_write
 from ..garment import template
@@ -44,6 +46,7 @@ def train(
     loss: Loss | None = None,
     optimizer: optax.GradientTransformation | None = None,
     steps: int | None = None,
+    devices: int | None = None,
     report: _Report | None = None,
 ) -> Predictor:
     """Trains a network, or resumes the run in a folder.
@@ -58,6 +61,8 @@ def train(
             Non-finite updates are skipped.
         steps: Stop after this many steps in total instead of all epochs (the learning
             rate still follows the full length).
+        devices: Devices of each process among which batches are split; if None, as many as divide
+            them. The result doesn't depend on it, up to rounding.
         report: Callback that takes the steps done, the total steps and the newest metrics.
 
     Returns:
@@ -69,6 +74,7 @@ def train(
     """
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    mesh = make_mesh(config.batch, devices)
     data = _load_data(config, sequences)
     total = max(len(data.frames) // config.batch, 1) * config.epochs
     problem, first = make_problem(
@@ -84,10 +90,10 @@ def train(
         optimizer=optimizer,
     )
     _check_same_run(folder / "config.json", config_json(config, data.frames.identity))
-    run = _Run(folder, problem, first, data, total)
+    run = _Run(folder, repeated(mesh, problem), repeated(mesh, first), data, total, mesh)
     try:
         run.train(total if steps is None else min(steps, total), report)
-        return make_predictor(problem, run.best())
+        return make_predictor(problem, at_home(run.best()))
     finally:
         run.close()
 
@@ -148,6 +154,7 @@ class _Run:
         first: The state before the first step.
         data: Frames.
         total: Steps of the whole run.
+        mesh: Devices.
     """
 
     def __init__(
@@ -157,9 +164,13 @@ class _Run:
         first: TrainState,
         data: _Data,
         total: int,
+        mesh: Mesh,
     ) -> None:
         self._problem, self._first, self._data, self._total = problem, first, data, total
-        self._config, self._folder = problem.config, folder
+        self._config, self._folder, self._mesh = problem.config, folder, mesh
+        # One process writes what isn't a checkpoint.
+        self._writes = jax.process_index() == 0
+        self._alone = False
         self._checkpoints = Checkpoints(folder / "checkpoints")
         self._best = Checkpoints(folder / "best", keep=1)
         restored = self._checkpoints.latest(first)
@@ -169,7 +180,7 @@ class _Run:
         logged = read_metrics(folder)
         self._stopping = EarlyStopping(logged, self._done, self._config.patience)
         self._gan = GanMonitor(logged, self._done)
-        self._board = TensorBoardLogger(folder)
+        self._board = TensorBoardLogger(folder) if self._writes else None
 
     def train(self, stop: int, report: _Report | None) -> None:
         """Steps until ``stop``, or until validation stops improving."""
@@ -178,8 +189,9 @@ class _Run:
 
         def log(values: dict[str, float]) -> None:
             values |= {"step": self._done, "seconds": round(time.perf_counter() - began, 3)}
-            append_line(self._folder / METRICS, values)
-            self._board.write(values, self._done)
+            if self._board is not None:
+                append_line(self._folder / METRICS, values)
+                self._board.write(values, self._done)
             if report is not None:
                 report(self._done, stop, values)
 
@@ -187,11 +199,19 @@ class _Run:
         while self._done < stop and not self._stopping.exhausted:
             index = batch_indices(len(frames), config.batch, config.seed, self._done)
             step_key = jax.random.fold_in(key, self._done)
-            self._state, metrics = train_step(
-                self._problem, self._state, take(frames, index), step_key
-            )
-            self._done += 1
-            self._check_finite()
+            batch = split(self._mesh, take(frames, index[own_rows(len(index))]))
+            try:
+                self._state, metrics = train_step(self._problem, self._state, batch, step_key)
+                self._done += 1
+                self._check_finite()
+            except jax.errors.JaxRuntimeError as error:
+                if jax.process_count() == 1:
+                    raise
+                self._alone = True
+                raise PhysXNetError(
+                    f"step {self._done}: another process of this run has ended. Start all of them"
+                    " again: training resumes from the last checkpoint."
+                ) from error
             if self._done % 20 == 0 or self._done == stop:
                 values = {k: float(v) for k, v in metrics.items()}
                 log(values | self._gan.update(values))
@@ -213,11 +233,12 @@ class _Run:
     def _validate(self, log: Callable[[dict[str, float]], None]) -> None:
         if self._data.unseen is None:
             return
-        losses, shown = _validate(self._problem, self._state, self._data.unseen)
+        losses, shown = _validate(self._problem, self._state, self._data.unseen, self._mesh)
         if self._stopping.update(losses["validation_mm"]):
             self._best.save(self._state)
         log(losses)
-        self._board.show(shown, self._done)
+        if self._board is not None:
+            self._board.show(shown, self._done)
 
     def best(self) -> TrainState:
         """The state that did best in validation; the last one without validation."""
@@ -226,7 +247,11 @@ class _Run:
 
     def close(self) -> None:
         """Saves what isn't saved yet."""
-        self._board.close()
+        if self._board is not None:
+            self._board.close()
+        # All processes write a checkpoint together.
+        if self._alone:
+            return
         self._checkpoints.save(self._state)
         self._checkpoints.close()
         self._best.close()
@@ -244,7 +269,7 @@ def _held_out(config: TrainConfig, sequences: Items[Sequence]) -> list[Sequence]
 
 
 def _validate(
-    problem: Problem, state: TrainState, frames: Frames
+    problem: Problem, state: TrainState, frames: Frames, mesh: Mesh
 ) -> tuple[dict[str, float], dict[str, tuple[np.ndarray, np.ndarray]]]:
     """Mean absolute errors [mm] on held-out frames, and maps of a frame in the middle."""
     config = problem.config
@@ -259,7 +284,7 @@ def _validate(
         for t in config.model.templates:
             # Padding of the last batch has zero weight.
             batch[f"weight_{t}"][len(real) :] = 0.0
-        losses, maps = eval_step(problem, state, batch)
+        losses, maps = eval_step(problem, state, repeated(mesh, batch))
         for t, value in losses.items():
             count = float(batch[f"weight_{t}"].sum())
             sums[t] += count * float(value)

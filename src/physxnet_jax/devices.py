@@ -1,0 +1,111 @@
+"""Devices and processes: one mesh, over which batches are split and all else is repeated."""
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from .errors import PhysXNetError
+
+_AXIS = "batch"
+# Variables in which a launcher says how many processes it started.
+_LAUNCHERS = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE")
+# A process that hasn't been heard of for this long has ended [s].
+_PATIENCE = 60
+
+
+def join_processes(
+    coordinator: str | None = None,
+    num_processes: int | None = None,
+    process_id: int | None = None,
+) -> int:
+    """Joins the processes of a run, which may be on several machines.
+
+    Call it before anything is computed. Without arguments, Slurm and Open MPI say what the
+    processes are; a process that was started alone stays alone.
+
+    Args:
+        coordinator: Address of the first process, ``HOST:PORT``.
+        num_processes: Number of processes.
+        process_id: This one's number, from 0.
+
+    Returns:
+        This process's number.
+
+    Raises:
+        PhysXNetError: Some of the three are missing, or the processes didn't meet.
+    """
+    given = (coordinator, num_processes, process_id)
+    launched = any(int(os.environ.get(name, "1")) > 1 for name in _LAUNCHERS)
+    if given == (None, None, None) and not launched:
+        return 0
+    if None in given and given != (None, None, None):
+        raise PhysXNetError(
+            "coordinator, num_processes and process_id belong together: give all three, or none"
+            " under Slurm or Open MPI."
+        )
+    try:
+        jax.config.update("jax_cpu_collectives_implementation", "gloo")
+        jax.distributed.initialize(
+            coordinator, num_processes, process_id, heartbeat_timeout_seconds=_PATIENCE
+        )
+    except (RuntimeError, ValueError) as error:
+        raise PhysXNetError(f"The processes didn't meet at {coordinator}: {error}") from error
+    return jax.process_index()
+
+
+def make_mesh(batch: int, devices: int | None = None) -> Mesh:
+    """A mesh of devices that share a batch equally.
+
+    Args:
+        batch: Size of the batch.
+        devices: Number of devices of each process; if None, as many as divide the batch.
+
+    Raises:
+        PhysXNetError: Fewer devices, or they don't divide the batch.
+    """
+    own = len(jax.local_devices())
+    processes = jax.process_count()
+    if devices is None:
+        usable = [k for k in range(1, own + 1) if batch % (k * processes) == 0]
+        devices = max(usable, default=1)
+    if not 1 <= devices <= own:
+        raise PhysXNetError(f"{devices} devices: this machine has {own}.")
+    if batch % (devices * processes):
+        raise PhysXNetError(
+            f"a batch of {batch} can't be split among {devices * processes} devices; choose a"
+            " number that divides it."
+        )
+    chosen = []
+    for process in range(processes):
+        chosen += [d for d in jax.devices() if d.process_index == process][:devices]
+    return Mesh(np.asarray(chosen), (_AXIS,))
+
+
+def repeated(mesh: Mesh, tree: Any) -> Any:
+    """Arrays of a pytree, whole on every device."""
+    sharding = NamedSharding(mesh, PartitionSpec())
+    return jax.tree.map(
+        lambda x: jax.make_array_from_process_local_data(sharding, np.asarray(x)), tree
+    )
+
+
+def at_home(tree: Any) -> Any:
+    """Arrays of a pytree that are whole on every device, on this process's first device."""
+    return jax.tree.map(jnp.asarray, jax.device_get(tree))
+
+
+def own_rows(count: int) -> slice:
+    """Rows of a batch that this process loads."""
+    each = count // jax.process_count()
+    return slice(each * jax.process_index(), each * (jax.process_index() + 1))
+
+
+def split(mesh: Mesh, rows: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
+    """A batch over all devices, from the rows that this process has loaded."""
+    sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
+    return {k: jax.make_array_from_process_local_data(sharding, v) for k, v in rows.items()}
