@@ -22,6 +22,7 @@ import time
 from collections.abc import Iterator
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.progress import track
 
@@ -102,15 +103,17 @@ def several(
             "moved_mm": 1e3 * float(out.diagnostics["slipped"].max()),
             "off": bool(out.diagnostics["slipped"].max() > OFF),
             "self_crossing": faults.self_crossing,
-            "hem_mm": max(uneven_hem(g) for g in garments),
+            "hem_mm": max(uneven_hem(g, scene.assembly.rest_body) for g in garments),
             "ms_per_frame": each,
             "vertices": len(scene.assembly.rest),
         }
 
 
-def uneven_hem(garment: Garment) -> float:
-    """Largest distance of a hem at rest from its mean height [mm]."""
-    y = np.asarray(garment.mesh.vertices)[np.unique(np.asarray(garment.loops["hem"])), 1]
+def uneven_hem(garment: Garment, rest_body: np.ndarray) -> float:
+    """Largest distance of a hem, at rest on the person, from its mean height [mm]."""
+    y = np.asarray(garment.rest_vertices(jnp.asarray(rest_body, jnp.float32)))[
+        np.unique(np.asarray(garment.loops["hem"])), 1
+    ]
     return 1e3 * float(np.abs(y - y.mean()).max())
 
 

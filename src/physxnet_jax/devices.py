@@ -12,8 +12,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from .errors import PhysXNetError
 
 _AXIS = "batch"
-# Variables in which a launcher says how many processes it started.
-_LAUNCHERS = ("SLURM_NTASKS", "OMPI_COMM_WORLD_SIZE")
+# Variables in which a launcher says how many processes it started: srun, mpirun.
+_LAUNCHERS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
 # A process that hasn't been heard of for this long has ended [s].
 _PATIENCE = 60
 

@@ -168,8 +168,6 @@ class _Run:
     ) -> None:
         self._problem, self._first, self._data, self._total = problem, first, data, total
         self._config, self._folder, self._mesh = problem.config, folder, mesh
-        # One process writes what isn't a checkpoint.
-        self._writes = jax.process_index() == 0
         self._alone = False
         self._checkpoints = Checkpoints(folder / "checkpoints")
         self._best = Checkpoints(folder / "best", keep=1)
@@ -180,7 +178,8 @@ class _Run:
         logged = read_metrics(folder)
         self._stopping = EarlyStopping(logged, self._done, self._config.patience)
         self._gan = GanMonitor(logged, self._done)
-        self._board = TensorBoardLogger(folder) if self._writes else None
+        # One process writes what isn't a checkpoint.
+        self._board = TensorBoardLogger(folder) if jax.process_index() == 0 else None
 
     def train(self, stop: int, report: _Report | None) -> None:
         """Steps until ``stop``, or until validation stops improving."""

@@ -12,7 +12,7 @@ from ...geometry import connected_components, mesh_edges, vertex_faces
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Clock, Effect, Prepared
-from ._pairs import ClothContact, Facing, Pairs, closest_of, foot_of, side_normal
+from ._pairs import ClothContact, Facing, Pairs, closest_of, foot_of, side_normal, smooth_normals
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,7 +154,7 @@ class _SelfContact(ClothContact):
         valid &= other != jnp.arange(count, dtype=jnp.int32)[:, None]
         valid &= self.part[other] == self.part[:, None]
         valid &= squared < (2.0 * cell) ** 2
-        normal = self.normals(x)
+        normal = smooth_normals(x[..., None], self.faces)[..., 0]
         front = jnp.sum(gap * normal[:, None], axis=2) >= 0
         out = []
         for side in (front, ~front):
@@ -163,12 +163,6 @@ class _SelfContact(ClothContact):
             there = jnp.isfinite(jnp.take_along_axis(measure, best, axis=1))[:, 0]
             out.append(jnp.where(there, jnp.take_along_axis(other, best, axis=1)[:, 0], -1))
         return jnp.stack(out), jnp.sum(jnp.maximum(counts - law.room, 0), dtype=jnp.int32)
-
-    def normals(self, x: Float[Array, "vertices 3"]) -> Float[Array, "vertices 3"]:
-        """Area-weighted vertex normals, not normalised."""
-        a, b, c = (x[self.faces[:, i]] for i in range(3))
-        n = jnp.cross(b - a, c - a)
-        return jnp.zeros_like(x).at[self.faces.reshape(-1)].add(jnp.repeat(n, 3, axis=0))
 
     def diagnose(self, displacement: Array, context: Facing) -> dict[str, Array]:
         pairs = context.pairs
