@@ -10,12 +10,15 @@ export PYTHONDONTWRITEBYTECODE =
 
 .PHONY: demo test test-release test-nightly check docs format clean
 
+# More extras of pyproject.toml: `make test EXTRAS=cluster` also tests Ray.
+EXTRAS ?=
+
 # One environment serves all targets; uv.lock decides every version.
 $(VENV)/.ready: pyproject.toml uv.lock
 	@$(PYTHON) -c "import sys; v = sys.version_info; sys.exit(0 if (3, 11) <= v[:2] < (3, 14) else f'physxnet_jax needs Python 3.11 to 3.13, $(PYTHON) is {v[0]}.{v[1]}: set PYTHON=python3.12, say')"
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet "uv>=0.8"
-	UV_PROJECT_ENVIRONMENT=$(abspath $(VENV)) $(BIN)/uv sync --quiet --frozen --inexact --python $(BIN)/python --extra usd --extra gltf --extra mesh --extra viewer --extra render --extra train --extra export --extra docs --extra dev
+	UV_PROJECT_ENVIRONMENT=$(abspath $(VENV)) $(BIN)/uv sync --quiet --frozen --inexact --python $(BIN)/python --extra usd --extra gltf --extra mesh --extra viewer --extra render --extra train --extra export --extra docs --extra dev $(EXTRAS:%=--extra %)
 	@touch $@
 
 demo: $(VENV)/.ready

@@ -28,8 +28,8 @@ from physxnet_jax.data import (
     dataset_digest,
     is_trainable,
     list_sequences,
-    read_log,
     read_sequence,
+    read_times,
 )
 from physxnet_jax.evaluation import MIRROR, ActionError, error_tables, means, summary_table
 from physxnet_jax.files import atomic_write
@@ -265,7 +265,7 @@ def note_datasets(folder: pathlib.Path) -> None:
         if not any(s.offsets for s in sequences):
             continue
         digest, size = dataset_digest(folder / name)
-        log = read_log(folder / name)
+        log = read_times(folder / name)
         known[name] = {
             "actions": len(sequences),
             "frames": sum(s.motion.num_frames for s in sequences),

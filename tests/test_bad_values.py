@@ -10,7 +10,7 @@ import runpy
 import numpy as np
 import pytest
 
-from physxnet_jax.data import open_dataset, read_log, read_sequence, write_action, write_garment
+from physxnet_jax.data import open_dataset, read_sequence, read_times, write_action, write_garment
 from physxnet_jax.data._store import write_offsets
 from physxnet_jax.dressing import load_scene, read_character
 from physxnet_jax.errors import FormatError, MotionError, PhysXNetError, WeightsError
@@ -323,8 +323,9 @@ def test_damaged_metadata_files_are_reported(dataset, text):
         with pytest.raises(FormatError):
             read_sequence(dataset / "walk")
         path.write_bytes(before)
-    (dataset / "build_log.jsonl").write_bytes(text.encode("latin-1") + b"\n")
-    assert read_log(dataset) in ([], [{}], [{"attributes": 3}])
+    (dataset / "times").mkdir()
+    (dataset / "times/walk-top.json").write_bytes(text.encode("latin-1"))
+    assert read_times(dataset) in ([], [{}], [{"attributes": 3}])
     if text != "{}":
         (dataset / "card.json").write_bytes(text.encode("latin-1"))
         with pytest.raises(WeightsError):

@@ -130,3 +130,40 @@ def test_losses_of_adam_agree_on_two_devices(tmp_path):
     one, two = losses(tmp_path / "one"), losses(tmp_path / "two")
     np.testing.assert_array_equal(one[:, 0], two[:, 0])
     np.testing.assert_allclose(one[:, 1], two[:, 1], rtol=1e-3)
+
+
+# With a second device as JAX's default, in the place of an accelerator.
+PREPARE = """
+import jax, jax.numpy as jnp
+processor, other = jax.devices()
+jax.config.update("jax_default_device", other)
+from physxnet_jax.devices import prepared_on_processor
+from physxnet_jax.dressing import clothe, make_dresser
+from physxnet_jax.motion import load_motion
+from physxnet_jax.simulation import XPBD, Scene, make_system, prepare_scene, simulate_batch
+from physxnet_jax.garment import template
+seen = []
+@prepared_on_processor
+def prepare():
+    x = jnp.ones(3)
+    seen.extend(x.devices())
+    return {"x": x, "name": "a"}
+made = prepare()
+assert seen == [processor] and made["x"].devices() == {other} and not made["x"].committed
+assert jnp.zeros(()).devices() == {other}, "the default is restored"
+dresser = make_dresser(["bottom"], method="lbs")
+scene = prepare_scene(Scene((template("bottom"),)))
+for tree in (dresser, make_system(scene, XPBD(8, 1))):
+    arrays = [x for x in jax.tree.leaves(tree) if isinstance(x, jax.Array)]
+    assert arrays and all(x.devices() == {other} and not x.committed for x in arrays)
+motion = load_motion("punch", fps=30.0)
+out = clothe(dresser, motion.rotations[:2], motion.root[:2], 30.0)
+assert out.vertices["bottom"].devices() == {other}
+"""
+
+
+@pytest.mark.release
+def test_preparation_computes_on_the_processor_and_results_are_on_the_default_device():
+    flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
+    command = [sys.executable, "-c", PREPARE]
+    subprocess.run(command, env=os.environ | flags, check=True, timeout=240)

@@ -94,6 +94,7 @@ def test_simulation_page_holds_the_measured_tables():
         "visible_skin",
         "part_times",
         "batch_scaling",
+        "cuda",
         "textile",
     ):
         block = re.search(rf"<!-- begin {name} -->\n(.*?)<!-- end {name} -->", TEXT, re.S)

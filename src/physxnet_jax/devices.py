@@ -1,16 +1,21 @@
 """Devices and processes: one mesh, over which batches are split and all else is repeated."""
 
+import contextlib
+import functools
 import os
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ParamSpec, TypeVar
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from .errors import PhysXNetError
 
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 _AXIS = "batch"
 # Variables in which a launcher says how many processes it started: srun, mpirun.
 _LAUNCHERS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
@@ -109,3 +114,52 @@ def split(mesh: Mesh, rows: Mapping[str, np.ndarray]) -> dict[str, jax.Array]:
     """A batch over all devices, from the rows that this process has loaded."""
     sharding = NamedSharding(mesh, PartitionSpec(_AXIS))
     return {k: jax.make_array_from_process_local_data(sharding, v) for k, v in rows.items()}
+
+
+def _default_device() -> jax.Device:
+    chosen = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    if chosen is None:
+        return jax.local_devices()[0]
+    return jax.local_devices(backend=chosen)[0] if isinstance(chosen, str) else chosen
+
+
+@contextlib.contextmanager
+def on_processor() -> Iterator[None]:
+    """Within it, the processor is JAX's default device.
+
+    For what is prepared once: hundreds of small programs, whose compilation for an accelerator
+    takes a minute.
+    """
+    try:
+        processor = jax.local_devices(backend="cpu")[0]
+    # JAX_PLATFORMS may leave it out.
+    except RuntimeError:
+        yield
+        return
+    with jax.default_device(processor):
+        yield
+
+
+def prepared_on_processor(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Makes a function compute on the processor; arrays of its result go to the default device.
+
+    The arrays stay uncommitted: they can be used together with those of any device.
+    """
+
+    @functools.wraps(function)
+    def wrapped(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+        device = _default_device()
+        with on_processor():
+            if _default_device() == device:
+                return function(*args, **kwargs)
+            result = function(*args, **kwargs)
+        return jax.tree.map(_copied, result)
+
+    return wrapped
+
+
+def _copied(x: Any) -> Any:
+    """An array on the default device."""
+    if isinstance(x, jax.core.Tracer) or not isinstance(x, jax.Array):
+        return x
+    return jnp.asarray(np.asarray(x))

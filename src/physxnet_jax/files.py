@@ -1,6 +1,7 @@
 """Atomic file writing, JSON logs and safe reading of untrusted archives."""
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -116,7 +117,10 @@ def check_writable(path: str | pathlib.Path) -> None:
 
 
 def read_arrays(
-    path: str | pathlib.Path, names: Sequence[str] | None = None, *, limit: int = 2_000_000_000
+    path: str | pathlib.Path | bytes,
+    names: Sequence[str] | None = None,
+    *,
+    limit: int = 2_000_000_000,
 ) -> dict[str, np.ndarray]:
     """Reads arrays of an `.npz` by name; skips names that aren't in it.
 
@@ -124,7 +128,7 @@ def read_arrays(
     archive before memory is allocated.
 
     Args:
-        path: The archive.
+        path: The archive, or its content.
         names: Arrays to read; all if omitted.
         limit: Maximum total size of the arrays, uncompressed [bytes].
 
@@ -136,10 +140,12 @@ def read_arrays(
     out: dict[str, np.ndarray] = {}
     total = 0
     # Once the file opens, any later OSError means invalid offsets in the archive.
-    with pathlib.Path(path).open("rb"):
-        pass
+    if not isinstance(path, bytes):
+        with pathlib.Path(path).open("rb"):
+            pass
     try:
-        with zipfile.ZipFile(path) as archive:
+        file = io.BytesIO(path) if isinstance(path, bytes) else path
+        with zipfile.ZipFile(file) as archive:
             members = {i.filename.removesuffix(".npy"): i for i in archive.infolist()}
             for name in members if names is None else names:
                 if name not in members:

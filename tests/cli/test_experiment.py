@@ -6,7 +6,7 @@ import shutil
 import pytest
 
 from physxnet_jax.cli import main
-from physxnet_jax.data import dataset_digest, list_sequences, read_log
+from physxnet_jax.data import dataset_digest, list_sequences, read_times
 from physxnet_jax.dressing import EXPORTED
 from physxnet_jax.motion import load_motion, save_motion
 
@@ -48,7 +48,7 @@ def test_build_train_evaluate(tmp_path, capsys):
         mocap,
     ]
     assert main([*build, "--only", "run", "--json"]) == 0
-    assert len(list_sequences(root)) == 1 and len(read_log(root)) == 1
+    assert len(list_sequences(root)) == 1 and len(read_times(root)) == 1
     shown = json.loads(capsys.readouterr().out)
     assert shown["simulated"] == 1 and (shown["sha256"], shown["bytes"]) == dataset_digest(root)
     sheet = tmp_path / "sheet.png"

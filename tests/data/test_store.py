@@ -23,21 +23,23 @@ from physxnet_jax.data import (
     load_action,
     make_codec,
     open_dataset,
-    read_log,
+    read_note,
     read_protocol,
     read_sequence,
+    read_times,
     usable_garment,
     write_action,
     write_garment,
     write_offsets,
 )
 from physxnet_jax.data._build import action_motion
-from physxnet_jax.data._store import log_build
+from physxnet_jax.data._files import join, last_name
+from physxnet_jax.data._store import is_stored, write_times
 from physxnet_jax.errors import FormatError, MotionError
 from physxnet_jax.evaluation import skinning
 from physxnet_jax.garment import square_sheet, template
 from physxnet_jax.motion import load_motion, make_motion, save_motion
-from physxnet_jax.simulation import XPBD, Rollout, Scene, prepare_scene
+from physxnet_jax.simulation import XPBD, Rollout
 
 
 def stored(root, frames=70, seed=0):
@@ -60,7 +62,9 @@ def test_offsets_round_trip_within_half_a_quantization_step(tmp_path):
     assert np.abs(s.offsets["top"] - offsets).max() <= 0.5001e-4 + 1e-7
     assert s.split == "train" and s.meta["top"]["finite"] and s.motion.num_frames == 120
     assert s.meta["top"]["unit"] == "m" and s.meta["top"]["engine"] == "test"
-    assert list_sequences(tmp_path, "train") == [folder] and not list_sequences(tmp_path, "test")
+    assert list_sequences(tmp_path, "train") == [str(folder)] and not list_sequences(
+        tmp_path, "test"
+    )
 
 
 def test_predictive_coding_compresses_smooth_offsets(tmp_path):
@@ -222,15 +226,44 @@ def test_left_out_frames_overlap_no_action(data_dir):
         assert load_action(data_dir / "mocap", a).num_frames == a.frames
 
 
-def test_truncated_build_log_is_continued(tmp_path):
+def test_damaged_times_are_skipped_and_are_no_part_of_the_digest(tmp_path):
+    before = dataset_digest(tmp_path)
     for k in range(2):
-        log_build(tmp_path, {"k": k})
-    log = tmp_path / "build_log.jsonl"
-    log.write_bytes(log.read_bytes() + b'{"k": 2, "sec')
-    assert [line["k"] for line in read_log(tmp_path)] == [0, 1]
-    log_build(tmp_path, {"k": 3})
-    assert [line["k"] for line in read_log(tmp_path)] == [0, 1, 3]
-    assert read_log(tmp_path / "none") == []
+        write_times(tmp_path, f"walk{k}", "top", {"k": k})
+    (tmp_path / "times/walk0-top.json").write_bytes(b'{"k": 2, "sec')
+    assert [line["k"] for line in read_times(tmp_path)] == [1]
+    assert read_times(tmp_path / "none") == []
+    assert dataset_digest(tmp_path) == before
+
+
+@pytest.mark.parametrize("url", ["memory://a/set", "file://{}/b/", "file://{}/c/|ocdbt:", "{}/d"])
+def test_every_kind_of_store_holds_the_same_dataset(tmp_path, url):
+    root = url.format(tmp_path)
+    folder, offsets = stored(tmp_path / "plain")
+    write_offsets(folder, "top", offsets, {"finite": True})
+    sheet = square_sheet(9)
+    open_dataset(root, {"fps": 30})
+    assert read_note(root) == {"fps": 30}
+    write_garment(root, "top", np.asarray(sheet.mesh.vertices), np.asarray(sheet.mesh.faces))
+    write_action(join(root, "walk"), load_motion("walk"), "train")
+    assert not is_stored(join(root, "walk"), "top")
+    write_offsets(join(root, "walk"), "top", offsets, {"finite": True})
+    assert is_stored(join(root, "walk"), "top")
+    (where,) = list_sequences(root, "train")
+    a, b = read_sequence(where), read_sequence(folder)
+    np.testing.assert_array_equal(a.offsets["top"], b.offsets["top"])
+    np.testing.assert_array_equal(a.motion.rotations, b.motion.rotations)
+    assert a.name == b.name == "walk" and a.meta == b.meta
+    open_dataset(tmp_path / "plain", {"fps": 30})
+    assert dataset_digest(root) == dataset_digest(tmp_path / "plain")
+
+
+def test_stores_that_cannot_be_opened_or_written_are_reported(tmp_path):
+    with pytest.raises(FormatError, match="can't be opened"):
+        list_sequences("nothing://a/b")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(FormatError, match="can't be written"):
+        open_dataset(tmp_path / "file", {"fps": 30})
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "\xff"])
@@ -390,11 +423,9 @@ def test_exploded_simulation_does_not_stop_a_build(tmp_path, monkeypatch):
     told = {"finite": np.zeros(3), "speed_max": np.full(3, np.nan), "self_gap": np.full(3, np.inf)}
     rollout = Rollout((lost,), 30.0, told | {"strain_max": np.array([0.1, 0.2, 0.3])})
     monkeypatch.setattr(_build, "simulate_batch", lambda *a, **k: [rollout])
-    scene = prepare_scene(Scene((sheet,)))
-    write_garment(tmp_path, "top", np.asarray(sheet.mesh.vertices), np.asarray(sheet.mesh.faces))
     action = Action("train", "walk", "a.npz", 0.0, 3, None)
     config = DatasetConfig(templates=("top",))
-    _build._simulate(config, tmp_path / "walk", "top", action, scene, tmp_path, None)
+    _build._simulate(config, tmp_path, "top", (action,), tmp_path, None)
     meta = read_sequence(tmp_path / "walk").meta["top"]
     assert not meta["finite"] and not usable_garment(meta)
     assert meta["worst"] == {"strain_max": pytest.approx(0.3)}
@@ -411,12 +442,34 @@ def test_action_begins_at_its_start_time(tmp_path):
 
 def test_shards_partition_the_actions(data_dir, tmp_path, monkeypatch):
     done = []
-    monkeypatch.setattr(
-        _build, "_simulate", lambda config, at, name, action, *_: done.append(action.name)
-    )
+
+    def note(config, root, name, group, *_):
+        done.extend(a.name for a in group)
+        return []
+
+    monkeypatch.setattr(_build, "_simulate", note)
     config = DatasetConfig(splits=("train",), templates=("bottom",))
     names = [a.name for a in read_protocol(data_dir / "mocap") if a.split == "train"]
     for k in range(3):
         done.clear()
         count = build_dataset(config, tmp_path, data_dir / "mocap", shard=(k, 3))
         assert done == names[k::3] and count == len(done) > 5
+    # Side by side: of similar length, all of them once.
+    done.clear()
+    grouped = dataclasses.replace(config, people=4)
+    sizes = {a.name: a.frames for a in read_protocol(data_dir / "mocap")}
+    build_dataset(grouped, tmp_path / "grouped", data_dir / "mocap")
+    assert sorted(done) == sorted(names)
+    assert [sizes[n] for n in done] == sorted(sizes[n] for n in names)
+    with pytest.raises(FormatError, match="another configuration"):
+        build_dataset(config, tmp_path / "grouped", data_dir / "mocap")
+
+
+def test_people_side_by_side_need_this_simulator():
+    with pytest.raises(ValueError, match="takes 1"):
+        DatasetConfig(engine="blender", people=2)
+
+
+def test_parts_of_urls_are_joined_and_named():
+    assert last_name("s3://a/b/run/") == last_name("file:///a/|ocdbt:run") == "run"
+    assert join("a/b", "c", "d") == "a/b/c/d"

@@ -1,7 +1,6 @@
 """`physxnet dataset`: builds or checks a dataset."""
 
 import dataclasses
-import pathlib
 import time
 from collections.abc import Callable
 
@@ -16,8 +15,8 @@ from ..data import (
     dataset_digest,
     expected_frames,
     list_sequences,
-    read_log,
     read_sequence,
+    read_times,
 )
 from ..errors import FormatError
 from ..evaluation import Finding, check_sequence, method_by_name, skinning
@@ -28,6 +27,7 @@ from ..motion import Motion
 from ..viewer import render_frame
 from ._configs import mocap_folder, read_config
 from ._experiment_commands import Dataset
+from ._options import ray_address
 from ._progress import print_json, progress_bars
 
 _TILE = (220, 260)
@@ -53,9 +53,10 @@ def _build(command: Dataset, console: Console) -> int:
             only=command.only,
             report=lambda text, k, n: progress("garments", k, n),
             ask=_mean_prediction(config.networks) if config.networks else None,
+            ray=ray_address(command.ray),
         )
     digest, size = dataset_digest(command.out)
-    spent = sum(line["seconds"] for line in read_log(command.out))
+    spent = sum(line["seconds"] for line in read_times(command.out))
     console.print(
         f"{done} garments simulated in {time.perf_counter() - began:.0f} s ({spent:.0f} s for the"
         f" whole dataset); {size / 1e6:.1f} MB, sha256 {digest}",
@@ -88,7 +89,7 @@ def _shard(text: str) -> tuple[int, int]:
 def _check(command: Dataset, console: Console) -> int:
     if command.contact_sheet is not None:
         check_writable(command.contact_sheet)
-    root = pathlib.Path(command.target)
+    root = command.target
     folders = list_sequences(root)
     if not folders:
         raise FormatError(f"{root}: no actions found.")

@@ -6,6 +6,7 @@ from ..evaluation import ActionError, error_tables, evaluate_dataset, row_json, 
 from ..files import atomic_write
 from ..viewer import draw_bars
 from ._experiment_commands import Evaluate
+from ._options import ray_address
 from ._progress import print_json, progress_bars
 
 
@@ -20,6 +21,7 @@ def evaluate(command: Evaluate, console: Console) -> int:
             train_data=command.train_data,
             out=command.out,
             times=command.times,
+            ray=ray_address(command.ray),
             report=progress,
         )
     console.print(summary_table(rows), markup=False, highlight=False, soft_wrap=True)

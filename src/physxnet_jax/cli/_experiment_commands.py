@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ._options import QuietTerminal, Terminal
+from ._options import QuietTerminal, RayAddress, Terminal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +25,8 @@ class Stress:
     """Other simulators that run the cases they can (PHYSXNET_BLENDER, PHYSXNET_NEWTON)."""
     out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
     """Write the rows to this file, as JSON."""
+    ray: RayAddress = None
+    """Run the cases on a Ray cluster: its address, or none for one on this machine."""
     terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
@@ -85,10 +87,13 @@ class Bench:
 class Dataset:
     """Build a dataset of simulated clothes from motion files, or check one.
 
-    An interrupted build resumes if the same command is run again. Shards can run in parallel.
+    An interrupted build resumes if the same command is run again. With --ray, jobs of one garment
+    on one group of actions run on all cores of a machine or cluster; shards are for queues without
+    Ray. Every way stores the same bytes.
 
     Examples:
       physxnet dataset build experiments/datasets.toml#ours --out runs/ours
+      physxnet dataset build experiments/datasets.toml#ours --out runs/ours --ray
       physxnet dataset build experiments/datasets.toml#blender --out runs/b --shard 1/4
       physxnet dataset check runs/ours --contact-sheet out/ours.png
     """
@@ -97,13 +102,16 @@ class Dataset:
     """build: simulate. check: look for explosions, penetration, jitter, wrong counts."""
     target: tyro.conf.Positional[str]
     """build: a configuration, FILE.toml or FILE.toml#TABLE. check: a dataset's folder."""
-    out: Annotated[pathlib.Path | None, tyro.conf.arg(aliases=["-o"])] = None
-    """build: the dataset's folder."""
+    out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+    """build: the dataset's folder, or a URL that tensorstore takes (s3://, gs://)."""
     mocap: pathlib.Path | None = None
     """Folder of ACTIONS.csv and the motion files; by default mocap in $PHYSXNET_DATA or ../shared.
     docs/protocol.md describes its contents."""
+    ray: RayAddress = None
+    """build: use a Ray cluster: its address, or none for one on this machine. All its machines need
+    to see --out and --mocap."""
     shard: str = "0/1"
-    """build: i/n, every n-th action from the i-th."""
+    """build: i/n, every n-th group of actions from the i-th."""
     only: tuple[str, ...] = ()
     """build: names of the actions to build; all by default."""
     contact_sheet: pathlib.Path | None = None
@@ -125,8 +133,8 @@ class Train:
 
     config: tyro.conf.Positional[str]
     """A TrainConfig: FILE.toml or FILE.toml#TABLE."""
-    data: tyro.conf.UseAppendAction[tuple[pathlib.Path, ...]]
-    """Folders of datasets."""
+    data: tyro.conf.UseAppendAction[tuple[str, ...]]
+    """Folders or URLs of datasets."""
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
     """The run's folder: checkpoints, metrics.jsonl, TensorBoard events, weights."""
     splits: tuple[str, ...] = ("train",)
@@ -161,11 +169,11 @@ class Evaluate:
 
     methods: tyro.conf.Positional[tuple[str, ...]]
     """Methods to measure."""
-    data: pathlib.Path
-    """Folder of the reference dataset."""
+    data: str
+    """Folder or URL of the reference dataset."""
     split: str = "test"
     """train, test or extra."""
-    train_data: pathlib.Path | None = None
+    train_data: str | None = None
     """Dataset that nearest and mlp learn from; --data by default."""
     templates: tuple[Literal["top", "bottom", "dress"], ...] = ("top", "bottom", "dress")
     """Garments to measure."""
@@ -174,4 +182,7 @@ class Evaluate:
     Existing rows are kept."""
     times: bool = False
     """Only measure the times of these methods' rows again, in one run."""
+    ray: RayAddress = None
+    """Measure on a Ray cluster, an action a job: its address, or none for one on this machine.
+    Its times are those of one core."""
     terminal: Terminal = dataclasses.field(default_factory=Terminal)

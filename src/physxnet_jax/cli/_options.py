@@ -7,12 +7,30 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from ..errors import PhysXNetError
+from ..jobs import LOCAL
 
 if TYPE_CHECKING:
     from ..dressing import Inference, Simulation
 
 Accuracy = Literal["draft", "standard", "fine", "reference"]
 Fabric = Literal["cotton", "denim", "silk", "wool", "jersey", "leather"]
+
+
+RayAddress = tuple[str, ...] | None
+"""Of an option that may stand without a value."""
+
+
+def ray_address(option: RayAddress) -> str | None:
+    """The address for `run_jobs`.
+
+    Raises:
+        PhysXNetError: More than one address.
+    """
+    if option is None:
+        return None
+    if len(option) > 1:
+        raise PhysXNetError(f"--ray takes one address, got {' '.join(option)}.")
+    return option[0] if option else LOCAL
 
 
 @dataclasses.dataclass(frozen=True)

@@ -4,15 +4,26 @@ import dataclasses
 
 import jax
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from ..dressing import EXTERNAL_ENGINES
 from ..errors import PhysXNetError
 from ..evaluation import CASES, PEER_CASES, Finding, run_case, run_peer
 from ..files import check_writable, write_json
+from ..jobs import Job, run_jobs
 from ._experiment_commands import Stress
-from ._progress import print_json
+from ._options import ray_address
+from ._progress import print_json, progress_bars
+
+
+def _run(name: str, peers: tuple[str, ...]) -> tuple[list[Finding], dict[str, dict[str, float]]]:
+    """Findings of a case, and what other simulators measure in it."""
+    mine, theirs = run_case(name), {}
+    if name in PEER_CASES:
+        theirs = {peer: run_peer(name, EXTERNAL_ENGINES[peer]) for peer in peers}
+    # Every case compiles its own programs; cached, they would fill the memory.
+    jax.clear_caches()
+    return mine, theirs
 
 
 def stress(command: Stress, console: Console) -> int:
@@ -23,18 +34,18 @@ def stress(command: Stress, console: Console) -> int:
     if unknown:
         raise PhysXNetError(f"No case {', '.join(unknown)}; there are {', '.join(CASES)}.")
     names = command.cases or tuple(CASES)
-    rows: list[Finding] = []
     peer_results: dict[tuple[str, str], dict[str, float]] = {}
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("hard cases", total=len(names))
-        for name in names:
-            rows += run_case(name)
-            if name in PEER_CASES:
-                for peer in command.peers:
-                    peer_results[peer, name] = run_peer(name, EXTERNAL_ENGINES[peer])
-            # Every case compiles its own programs; cached, they would fill the memory.
-            jax.clear_caches()
-            bar.advance(task)
+    jobs = [Job(name, _run, (name, command.peers)) for name in names]
+    found: dict[str, list[Finding]] = {}
+    with progress_bars(console) as progress:
+
+        def report(_: str, done: int, total: int) -> None:
+            progress("hard cases", done, total)
+
+        for job, (mine, theirs) in run_jobs(jobs, ray=ray_address(command.ray), report=report):
+            found[job.name] = mine
+            peer_results |= {(peer, job.name): values for peer, values in theirs.items()}
+    rows = [row for name in names for row in found[name]]
     table = Table(title=f"{sum(r.holds for r in rows)} of {len(rows)} bounds hold")
     for column in ("case", "quantity", "bound", "measured", "holds", *command.peers):
         left = column in ("case", "quantity", "holds")

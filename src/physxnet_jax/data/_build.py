@@ -1,5 +1,6 @@
 """Builds a dataset: simulates every action with every template."""
 
+import functools
 import math
 import pathlib
 import time
@@ -13,6 +14,7 @@ import numpy as np
 from ..body import Body
 from ..errors import FormatError
 from ..garment import Template, template
+from ..jobs import Job, Report, run_jobs
 from ..motion import (
     Motion,
     animate,
@@ -25,43 +27,53 @@ from ..motion import (
 from ..simulation import PreparedScene, Rollout, Scene, prepare_scene, simulate_batch
 from ..simulation.blender import simulate_blender
 from ._config import CARD, DatasetConfig
+from ._files import join
 from ._protocol import FPS, Action, left_out, load_action, read_protocol
 from ._store import (
     QUANTIZATION_STEP,
+    Where,
     is_stored,
-    log_build,
     open_dataset,
     read_note,
     write_action,
     write_garment,
     write_offsets,
+    write_times,
 )
+
+Ask = Callable[[Motion, Template], np.ndarray]
+"""Predicts a garment's vertices [m]."""
 
 
 def build_dataset(
     config: DatasetConfig,
-    root: str | pathlib.Path,
+    root: Where,
     folder: str | pathlib.Path,
     *,
     shard: tuple[int, int] = (0, 1),
     only: tuple[str, ...] = (),
-    report: Callable[[str, int, int], None] | None = None,
-    ask: Callable[[Motion, Template], np.ndarray] | None = None,
+    report: Report | None = None,
+    ask: Ask | None = None,
+    ray: str | None = None,
 ) -> int:
     """Simulates actions and stores the cloth relative to its skinning.
 
-    Existing results are kept, so an interrupted build can be resumed. Several shards can be
-    built concurrently into one folder.
+    Existing results are kept, so an interrupted build can be resumed. A job is one garment on one
+    group of actions (`DatasetConfig.people`): on a Ray cluster or in several shards, which can be
+    built concurrently into one store, the bytes are those of one process on such a processor.
 
     Args:
         config: Settings of the dataset.
-        root: Folder of the dataset.
+        root: Folder of the dataset, or a URL that tensorstore takes.
         folder: Folder with the motion files and ``ACTIONS.csv``.
-        shard: ``(i, n)``: every n-th action, starting with the i-th.
+        shard: ``(i, n)``: every n-th action (or group of actions, see `DatasetConfig.people`),
+            starting with the i-th.
         only: Names of the actions to build; all of them if empty.
         report: Callback that takes a message, the jobs done and the total number of jobs.
         ask: Predicts a garment's vertices [m], shape [frames, vertices, 3], with the networks
             of the configuration. Required if and only if the engine is ``network``.
+        ray: Address of a Ray cluster whose machines all see ``root`` and ``folder``, or ``local``;
+            None to build in this process.
 
     Returns:
         Number of garments simulated by this call.
@@ -71,7 +83,8 @@ def build_dataset(
             ``upper_from`` selects the action itself, or ``ask`` doesn't match the engine.
         MotionError: ``folder`` holds no protocol.
     """
-    root = pathlib.Path(root)
+    folder = pathlib.Path(folder).absolute()
+    root = root if "://" in str(root) else pathlib.Path(root).absolute()
     if (config.engine == "network") != (ask is not None):
         raise FormatError(f"engine is '{config.engine}'; pass ask if and only if it is 'network'.")
     actions = _actions_in_splits(folder, config.splits)
@@ -95,35 +108,26 @@ def build_dataset(
             )
     actions = [a for a in actions if not only or a.name in only]
     open_dataset(root, _note(config))
-    own_actions = actions[shard[0] :: shard[1]]
-    jobs: list[tuple[Template, Action]] = [(t, a) for t in config.templates for a in own_actions]
-    done = 0
-    prepared: tuple[str, PreparedScene] | None = None
-    for k, (name, action) in enumerate(jobs):
-        if report is not None:
-            report(f"{action.name}, {name}", k, len(jobs))
-        target = root / action.slug
-        if is_stored(target, name):
-            continue
-        if prepared is None or prepared[0] != name:
-            # Programs compiled for the previous garment are no longer needed.
-            jax.clear_caches()
-            prepared = (name, prepare_scene(Scene((template(name),))))
-        scene = prepared[1]
-        assembly = scene.assembly
-        write_garment(root, name, assembly.rest, np.asarray(assembly.faces))
-        _simulate(config, target, name, action, scene, pathlib.Path(folder), ask)
-        done += 1
-    if report is not None:
-        report("done", len(jobs), len(jobs))
-    return done
+    own_groups = _groups(config, actions)[shard[0] :: shard[1]]
+    jobs = []
+    for name in config.templates:
+        for group in own_groups:
+            missing = sum(not is_stored(join(root, a.slug), name) for a in group)
+            label = f"{', '.join(a.name for a in group)}: {name}"
+            if missing:
+                job = Job(label, _simulate, (config, root, name, group, folder, ask))
+                jobs.append((job, missing))
+    for _, lines in run_jobs([job for job, _ in jobs], ray=ray, report=report):
+        for slug, line in lines:
+            write_times(root, slug, line["template"], line)
+    return sum(missing for _, missing in jobs)
 
 
-def expected_frames(root: str | pathlib.Path, folder: str | pathlib.Path) -> dict[str, int]:
+def expected_frames(root: Where, folder: str | pathlib.Path) -> dict[str, int]:
     """Expected number of frames of each action, from the dataset's own settings.
 
     Args:
-        root: Folder of the dataset.
+        root: Folder or URL of the dataset.
         folder: Folder with the motion files and ``ACTIONS.csv``.
     """
     note = read_note(root)
@@ -156,32 +160,70 @@ def _note(config: DatasetConfig) -> dict[str, Any]:
 
 def _changes(config: DatasetConfig) -> dict[str, Any]:
     """Settings that differ from their defaults; datasets of earlier versions don't list them."""
-    changes = {k: getattr(config, k) for k in ("left_out", "upper_from", "exaggerate")}
+    changes = {k: getattr(config, k) for k in ("left_out", "upper_from", "exaggerate", "people")}
     defaults = DatasetConfig()
     return {k: v for k, v in changes.items() if v != getattr(defaults, k)}
 
 
+def _groups(config: DatasetConfig, actions: list[Action]) -> list[tuple[Action, ...]]:
+    """Actions that are simulated side by side: of similar length, whichever exist already."""
+    if config.people > 1:
+        actions = sorted(actions, key=lambda a: (a.frames, a.slug))
+    starts = range(0, len(actions), config.people)
+    return [tuple(actions[k : k + config.people]) for k in starts]
+
+
+@functools.lru_cache(maxsize=1)
+def _prepared(name: Template) -> PreparedScene:
+    # Programs compiled for the previous garment are no longer needed.
+    jax.clear_caches()
+    return prepare_scene(Scene((template(name),)))
+
+
 def _simulate(
     config: DatasetConfig,
-    target: pathlib.Path,
+    root: Where,
     name: Template,
-    action: Action,
-    scene: PreparedScene,
+    group: tuple[Action, ...],
     folder: pathlib.Path,
-    ask: Callable[[Motion, Template], np.ndarray] | None,
-) -> None:
-    motion = action_motion(config, action, scene.assembly.body, folder)
-    write_action(target, motion, action.split)
+    ask: Ask | None,
+) -> list[tuple[str, dict[str, Any]]]:
+    """Stores a garment in a group of actions; returns what each took."""
+    scene = _prepared(name)
+    assembly = scene.assembly
+    write_garment(root, name, assembly.rest, np.asarray(assembly.faces))
+    motions = [action_motion(config, a, assembly.body, folder) for a in group]
+    for action, motion in zip(group, motions):
+        write_action(join(root, action.slug), motion, action.split)
     start = time.perf_counter()
     if ask is not None:
-        cloth = ask(motion, name)
-        finite = np.asarray(np.isfinite(cloth).all(axis=(1, 2)))
-        rollout = Rollout((cloth,), motion.fps, {"finite": finite})
+        rollouts = []
+        for motion in motions:
+            cloth = ask(motion, name)
+            finite = np.asarray(np.isfinite(cloth).all(axis=(1, 2)))
+            rollouts.append(Rollout((cloth,), motion.fps, {"finite": finite}))
     elif config.engine == "blender":
-        rollout = simulate_blender(Scene((template(name),)), motion, settings=config.blender)
+        one = Scene((template(name),))
+        rollouts = [simulate_blender(one, m, settings=config.blender) for m in motions]
     else:
-        rollout = simulate_batch(scene, [motion], solver=config.solver)[0]
-    seconds = time.perf_counter() - start
+        rollouts = simulate_batch(scene, motions, solver=config.solver)
+    seconds = round((time.perf_counter() - start) / len(group), 2)
+    lines = []
+    for action, motion, rollout in zip(group, motions, rollouts):
+        _store(config, join(root, action.slug), name, motion, rollout, scene)
+        line = {"action": action.name, "template": name, "frames": motion.num_frames}
+        lines.append((action.slug, line | {"seconds": seconds}))
+    return lines
+
+
+def _store(
+    config: DatasetConfig,
+    target: Where,
+    name: Template,
+    motion: Motion,
+    rollout: Rollout,
+    scene: PreparedScene,
+) -> None:
     offsets = rollout.positions[0] - skinned_cloth(scene, motion)
     # JSON has no infinity and no NaN.
     worst = {k: v for k, v in rollout.worst.items() if math.isfinite(v)}
@@ -196,12 +238,10 @@ def _simulate(
         offsets,
         {**config.settings(), "fps": motion.fps, "finite": finite, "worst": worst},
     )
-    line = {"action": action.name, "template": name, "frames": motion.num_frames}
-    log_build(target.parent, line | {"seconds": round(seconds, 2)})
 
 
 def action_motion(
-    config: DatasetConfig, action: Action, body: Body, folder: pathlib.Path
+    config: DatasetConfig, action: Action, body: Body, folder: str | pathlib.Path
 ) -> Motion:
     """Loads an action and applies the settings: upper body, exaggeration, mirror, speed."""
     motion = load_action(folder, action)

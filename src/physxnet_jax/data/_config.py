@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any, Literal
 
-from ..errors import check_numbers
+from ..errors import check_counts, check_numbers
 from ..garment import TEMPLATES, Template
 from ..simulation import XPBD
 from ..simulation.blender import BlenderSettings
@@ -35,6 +35,8 @@ class DatasetConfig:
         upper_from: Take spine, arms and head from the action this many places further on in
             the same split; 0 disables this.
         exaggerate: Factor on the deviation of each joint from its mean rotation.
+        people: Actions simulated side by side, as one batch; with the ``physxnet`` engine. Part of
+            the configuration because the last bits of a result depend on its batch.
         solver: Settings of this package's simulator.
         blender: Settings of Blender's simulator.
         networks: Names or folders of weights whose mean prediction is stored.
@@ -48,6 +50,7 @@ class DatasetConfig:
     speed: float = 1.0
     upper_from: int = 0
     exaggerate: float = 1.0
+    people: int = 1
     solver: XPBD = dataclasses.field(default_factory=XPBD)
     blender: BlenderSettings = dataclasses.field(default_factory=BlenderSettings)
     networks: tuple[str, ...] = ()
@@ -60,6 +63,9 @@ class DatasetConfig:
         ):
             if not given or set(given) - set(known):
                 raise ValueError(f"{name} are {given}; there are {', '.join(known)}.")
+        check_counts(self, "people")
+        if self.people > 1 and self.engine != "physxnet":
+            raise ValueError(f"people is {self.people}; the engine '{self.engine}' takes 1.")
         if (self.engine == "network") != bool(self.networks):
             raise ValueError(
                 f"engine is '{self.engine}', networks is {self.networks}: set networks if and only"

@@ -1,5 +1,6 @@
-"""Simulated actions on disk: zarr arrays through tensorstore, one folder per action.
+"""Simulated actions in a store: zarr arrays through tensorstore, one folder per action.
 
+A store is a folder or any URL that tensorstore takes (``s3://``, ``gs://``, ``file:///a/|ocdbt:``).
 ``dataset.json`` describes the dataset, ``garments/`` holds each garment once, and every
 action's folder holds the motion and one array per garment. The body follows from the motion.
 """
@@ -8,11 +9,10 @@ import contextlib
 import dataclasses
 import functools
 import hashlib
+import io
 import json
 import math
-import os
 import pathlib
-import shutil
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,18 +21,22 @@ import tensorstore as ts
 from jaxtyping import Float, Int
 
 from ..errors import FormatError
-from ..files import append_line, atomic_write, read_arrays, read_lines
-from ..motion import Motion, load_motion, save_motion
+from ..files import read_arrays
+from ..motion import Motion, make_motion
 from ._codec import Codec, make_codec
+from ._files import join, last_name, list_files, open_array, read_file, write_file
+
+Where = str | pathlib.Path
+"""A path or a URL."""
 
 # Offsets are rounded to tenths of a millimetre: the error is at most 0.05 mm.
 QUANTIZATION_STEP = 1e-4
 _MAX_OFFSET = 3.2
 # Largest number of coordinates that are read for one garment in one action.
 _MAX_COORDINATES = 3e8
-_NOTE = "dataset.json"
-# Timings differ between runs: the log isn't part of the dataset's digest.
-_LOG = "build_log.jsonl"
+_NOTE, _ACTION, _ARRAY, _MOTION = "dataset.json", "action.json", "zarr.json", "motion.npz"
+# Timings differ between runs: they aren't part of the dataset's digest.
+_TIMES, _OLD_LOG = "times", "build_log.jsonl"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,36 +59,33 @@ class Sequence:
     meta: dict[str, Any]
 
 
-def open_dataset(root: str | pathlib.Path, note: dict[str, Any]) -> None:
+def open_dataset(root: Where, note: dict[str, Any]) -> None:
     """Creates a dataset, or checks that the existing one has the same configuration.
 
     Raises:
         FormatError: The folder holds another dataset.
     """
-    path = pathlib.Path(root) / _NOTE
     text = json.dumps(note, indent=1, sort_keys=True)
-    if path.is_file():
-        if read_note(root) != json.loads(text):
-            raise FormatError(
-                f"{root}: the folder holds a dataset of another configuration. Choose another"
-                " folder or delete it."
-            )
-        return
-    with atomic_write(path) as part:
-        part.write_text(text)
+    if read_file(root, _NOTE) is None:
+        write_file(root, _NOTE, text.encode())
+    elif read_note(root) != json.loads(text):
+        raise FormatError(
+            f"{root}: the folder holds a dataset of another configuration. Choose another"
+            " folder or delete it."
+        )
 
 
-def read_note(root: str | pathlib.Path) -> dict[str, Any]:
+def read_note(root: Where) -> dict[str, Any]:
     """The settings that a dataset stores about itself.
 
     Raises:
         FormatError: The file is missing or damaged.
     """
-    path = pathlib.Path(root) / _NOTE
-    if not path.is_file():
+    found = read_file(root, _NOTE)
+    if found is None:
         raise FormatError(f"{root}: no {_NOTE}, not a dataset; build one first.")
-    with _report_damage(path):
-        return _as_dict(json.loads(path.read_text()))
+    with _report_damage(join(root, _NOTE)):
+        return _as_dict(json.loads(found))
 
 
 def _as_dict(parsed: object) -> dict[str, Any]:
@@ -94,7 +95,7 @@ def _as_dict(parsed: object) -> dict[str, Any]:
 
 
 def write_garment(
-    root: str | pathlib.Path,
+    root: Where,
     name: str,
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
@@ -104,9 +105,10 @@ def write_garment(
     Raises:
         FormatError: Another garment is stored under that name, or it has too many vertices.
     """
-    path = pathlib.Path(root) / "garments" / f"{name}.npz"
-    if path.is_file():
-        stored = _archive(path)
+    folder, file = join(root, "garments"), f"{name}.npz"
+    path, found = join(folder, file), read_file(folder, file)
+    if found is not None:
+        stored = _archive(path, found)
         if not (
             np.array_equal(stored["faces"], faces)
             and np.allclose(stored["vertices"], vertices, atol=1e-5)
@@ -121,27 +123,28 @@ def write_garment(
             f"{name}: {len(vertices):,} vertices; a dataset's garments have 32,767 at most."
         )
     codec = make_codec(vertices, faces)
-    with atomic_write(path) as part:
-        np.savez_compressed(
-            part,
-            vertices=np.asarray(vertices, np.float32),
-            faces=np.asarray(faces, np.int32),
-            order=codec.order.astype(np.int16),
-            parents=codec.parents.astype(np.int16),
-            weights=codec.weights.astype(np.int16),
-        )
+    content = io.BytesIO()
+    np.savez_compressed(
+        content,
+        vertices=np.asarray(vertices, np.float32),
+        faces=np.asarray(faces, np.int32),
+        order=codec.order.astype(np.int16),
+        parents=codec.parents.astype(np.int16),
+        weights=codec.weights.astype(np.int16),
+    )
+    write_file(folder, file, content.getvalue())
 
 
 @functools.lru_cache(maxsize=8)
-def _codec(path: pathlib.Path, changed: int) -> Codec:
-    data = _archive(path)
+def _codec(path: str, content: bytes) -> Codec:
+    data = _archive(path, content)
     return Codec(*(data[k].astype(np.int64) for k in ("order", "parents", "weights")))
 
 
-def _archive(path: pathlib.Path) -> dict[str, np.ndarray]:
+def _archive(path: str, content: bytes) -> dict[str, np.ndarray]:
     names = ("vertices", "faces", "order", "parents", "weights")
     with _report_damage(path):
-        data = read_arrays(path, names)
+        data = read_arrays(content, names)
         data = {name: data[name] for name in names}
         count = len(data["vertices"])
         integers = [data[k] for k in ("faces", "order", "parents", "weights")]
@@ -159,7 +162,7 @@ def _archive(path: pathlib.Path) -> dict[str, np.ndarray]:
 
 
 @contextlib.contextmanager
-def _report_damage(path: pathlib.Path) -> Iterator[None]:
+def _report_damage(path: Where) -> Iterator[None]:
     """Converts errors of a damaged file to `FormatError`."""
     try:
         yield
@@ -172,15 +175,17 @@ def _report_damage(path: pathlib.Path) -> Iterator[None]:
         ) from error
 
 
-def _codec_of(folder: pathlib.Path, template: str) -> Codec:
-    path = folder.parent / "garments" / f"{template}.npz"
-    if not path.is_file():
-        raise FormatError(f"{path}: missing; {folder.name}/{template} needs this garment.")
-    return _codec(path.absolute(), path.stat().st_mtime_ns)
+def _codec_of(folder: Where, template: str) -> Codec:
+    garments = join(str(folder).rstrip("/").removesuffix(last_name(folder)), "garments")
+    found = read_file(garments, f"{template}.npz")
+    path = join(garments, f"{template}.npz")
+    if found is None:
+        raise FormatError(f"{path}: missing; {last_name(folder)}/{template} needs this garment.")
+    return _codec(path, found)
 
 
 def write_offsets(
-    folder: pathlib.Path,
+    folder: Where,
     template: str,
     offsets: Float[np.ndarray, "frames vertices 3"],
     meta: dict[str, Any],
@@ -200,22 +205,36 @@ def write_offsets(
     integers = np.round(offsets / QUANTIZATION_STEP)
     if not np.isfinite(integers).all() or np.abs(integers).max() > _MAX_OFFSET / QUANTIZATION_STEP:
         raise FormatError(
-            f"{folder.name}/{template}: cloth is more than {_MAX_OFFSET} m from the body or not"
-            " finite; simulate it again with more substeps."
+            f"{last_name(folder)}/{template}: cloth is more than {_MAX_OFFSET} m from the body or"
+            " not finite; simulate it again with more substeps."
         )
     residuals = _codec_of(folder, template).encode(integers.astype(np.int64))
-    part = folder / f".{template}.part"
-    shutil.rmtree(part, ignore_errors=True)
+    attributes = {
+        **meta,
+        "unit": "m",
+        "quantum": QUANTIZATION_STEP,
+        "frames": len(offsets),
+        "sha256": hashlib.sha256(residuals.tobytes()).hexdigest(),
+    }
+    files = _array_files(residuals, attributes)
+    # The array exists once its description does.
+    for name in sorted(files, key=lambda n: n == _ARRAY):
+        write_file(join(folder, template), name, files[name])
+
+
+def _array_files(values: np.ndarray, attributes: dict[str, Any]) -> dict[str, bytes]:
+    """The files of a zarr array, by name."""
+    context = ts.Context()
     store = ts.open(
         {
             "driver": "zarr3",
-            "kvstore": {"driver": "file", "path": str(part)},
+            "kvstore": "memory://",
             "metadata": {
-                "shape": list(residuals.shape),
+                "shape": list(values.shape),
                 "data_type": "uint32",
                 "chunk_grid": {
                     "name": "regular",
-                    "configuration": {"chunk_shape": list(residuals.shape)},
+                    "configuration": {"chunk_shape": list(values.shape)},
                 },
                 "codecs": [
                     {"name": "bytes", "configuration": {"endian": "little"}},
@@ -229,74 +248,73 @@ def write_offsets(
                         },
                     },
                 ],
-                "attributes": {
-                    **meta,
-                    "unit": "m",
-                    "quantum": QUANTIZATION_STEP,
-                    "frames": len(offsets),
-                    "sha256": hashlib.sha256(residuals.tobytes()).hexdigest(),
-                },
+                "attributes": attributes,
             },
         },
         create=True,
+        context=context,
     ).result()
-    store.write(residuals).result()
-    final = folder / template
-    shutil.rmtree(final, ignore_errors=True)
-    os.replace(part, final)
+    store.write(values).result()
+    memory = ts.KvStore.open("memory://", context=context).result()
+    return {key.decode(): bytes(memory[key]) for key in memory.list().result()}
 
 
-def read_offsets(folder: pathlib.Path, template: str) -> Float[np.ndarray, "frames vertices 3"]:
+def read_offsets(folder: Where, template: str) -> Float[np.ndarray, "frames vertices 3"]:
     """Offsets [m] of one garment in one action.
 
     Raises:
         FormatError: The array is damaged.
     """
-    path = folder / template
-    codec, frames = _codec_of(folder, template), read_meta(folder, template).get("frames")
+    path = join(folder, template)
+    codec, meta = _codec_of(folder, template), read_meta(folder, template)
+    frames = meta.get("frames")
     with _report_damage(path):
-        spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(path)}}
-        store = ts.open(spec, read=True).result()
+        store = open_array(path).result()
         # Checked before allocation: a kilobyte on disk may declare gigabytes of zeros.
         fits = store.shape == (3, len(codec.order), frames) and store.dtype == ts.uint32
         if not fits or math.prod(store.shape) > _MAX_COORDINATES:
             raise ValueError("unexpected shape or data type")
         residuals = np.ascontiguousarray(store.read().result())
-    if hashlib.sha256(residuals.tobytes()).hexdigest() != read_meta(folder, template).get("sha256"):
+    if hashlib.sha256(residuals.tobytes()).hexdigest() != meta.get("sha256"):
         raise FormatError(
-            f"{folder.name}/{template}: the checksum is wrong; delete that folder and build"
+            f"{last_name(folder)}/{template}: the checksum is wrong; delete that folder and build"
             " the dataset again, only this part will be simulated."
         )
     return codec.decode(residuals).astype(np.float32) * np.float32(QUANTIZATION_STEP)
 
 
-def read_meta(folder: pathlib.Path, template: str) -> dict[str, Any]:
+def read_meta(folder: Where, template: str) -> dict[str, Any]:
     """Metadata of one garment in one action.
 
     Raises:
         FormatError: The metadata is damaged.
     """
-    path = folder / template / "zarr.json"
-    with _report_damage(path):
-        return _as_dict(_as_dict(json.loads(path.read_text()))["attributes"])
+    path = join(folder, template)
+    with _report_damage(join(path, _ARRAY)):
+        return _as_dict(_as_dict(json.loads(_existing(path, _ARRAY)))["attributes"])
 
 
-def is_stored(folder: pathlib.Path, template: str) -> bool:
+def _existing(where: Where, name: str) -> bytes:
+    found = read_file(where, name)
+    if found is None:
+        raise FileNotFoundError(join(where, name))
+    return found
+
+
+def is_stored(folder: Where, template: str) -> bool:
     """Whether a garment of an action is stored."""
-    return (folder / template / "zarr.json").is_file()
+    return read_file(join(folder, template), _ARRAY) is not None
 
 
-def write_action(folder: pathlib.Path, motion: Motion, split: str) -> None:
+def write_action(folder: Where, motion: Motion, split: str) -> None:
     """Writes the motion of an action and its split.
 
     Raises:
         FormatError: The folder holds another motion, which its garments belong to, or another
             split.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    motion_file = folder / "motion.npz"
-    if motion_file.is_file():
-        stored = load_motion(motion_file)
+    if read_file(folder, _MOTION) is not None:
+        stored = _read_motion(folder)
         pairs = ((stored.rotations, motion.rotations), (stored.root, motion.root))
         same = all(a.shape == b.shape and np.allclose(a, b, atol=1e-4) for a, b in pairs)
         if not same or stored.fps != motion.fps:
@@ -305,76 +323,85 @@ def write_action(folder: pathlib.Path, motion: Motion, split: str) -> None:
                 " another version. Delete that folder, or build into another one."
             )
     else:
-        save_motion(motion_file, motion)
-    note = folder / "action.json"
-    if note.is_file() and _action_note(note)["split"] != split:
+        content = io.BytesIO()
+        np.savez_compressed(
+            content,
+            rotations=np.asarray(motion.rotations),
+            root=np.asarray(motion.root),
+            fps=np.asarray(motion.fps),
+        )
+        write_file(folder, _MOTION, content.getvalue())
+    if read_file(folder, _ACTION) is not None and _action_note(folder)["split"] != split:
         raise FormatError(
-            f"{folder}: stored as '{_action_note(note)['split']}', now '{split}'. A"
+            f"{folder}: stored as '{_action_note(folder)['split']}', now '{split}'. A"
             " dataset whose splits changed must be rebuilt: choose another folder."
         )
-    with atomic_write(note) as part:
-        part.write_text(json.dumps({"name": motion.name, "split": split}))
+    write_file(folder, _ACTION, json.dumps({"name": motion.name, "split": split}).encode())
 
 
-def read_sequence(folder: str | pathlib.Path) -> Sequence:
+def _read_motion(folder: Where, name: str = "") -> Motion:
+    with _report_damage(join(folder, _MOTION)):
+        data = read_arrays(_existing(folder, _MOTION), ("rotations", "root", "fps"))
+        rate = float(data["fps"].reshape(()))
+        return make_motion(data["rotations"], data["root"], rate, name=name)
+
+
+def read_sequence(folder: Where) -> Sequence:
     """Reads an action with every garment that has been simulated for it.
 
     Raises:
         FormatError: The folder doesn't hold an action.
     """
-    folder = pathlib.Path(folder)
-    note = folder / "action.json"
-    if not note.is_file():
-        raise FormatError(f"{folder}: no action.json, not an action of a dataset.")
-    info = _action_note(note)
-    motion = load_motion(folder / "motion.npz")
-    # Names that begin with a dot are incomplete: in progress or interrupted.
-    found = sorted(p.parent.name for p in folder.glob("[!.]*/zarr.json"))
+    info = _action_note(folder)
+    # The description of an array is written last: what lacks it is in progress or interrupted.
+    parts = [name.split("/") for name in list_files(folder)]
+    found = [p[0] for p in parts if p[1:] == [_ARRAY]]
     return Sequence(
         info["name"],
         info["split"],
-        Motion(motion.rotations, motion.root, motion.fps, info["name"]),
+        _read_motion(folder, info["name"]),
         {name: read_offsets(folder, name) for name in found},
         {name: read_meta(folder, name) for name in found},
     )
 
 
-def list_sequences(root: str | pathlib.Path, split: str | None = None) -> list[pathlib.Path]:
+def list_sequences(root: Where, split: str | None = None) -> list[str]:
     """Folders of a dataset's actions, sorted, optionally of one split."""
-    out = []
-    for note in sorted(pathlib.Path(root).glob("*/action.json")):
-        if split is None or _action_note(note)["split"] == split:
-            out.append(note.parent)
-    return out
+    parts = [name.split("/") for name in list_files(root)]
+    folders = [join(root, p[0]) for p in parts if p[1:] == [_ACTION]]
+    return [f for f in folders if split is None or _action_note(f)["split"] == split]
 
 
-def _action_note(path: pathlib.Path) -> dict[str, str]:
-    with _report_damage(path):
-        parsed = json.loads(path.read_text())
+def _action_note(folder: Where) -> dict[str, str]:
+    found = read_file(folder, _ACTION)
+    if found is None:
+        raise FormatError(f"{folder}: no {_ACTION}, not an action of a dataset.")
+    with _report_damage(join(folder, _ACTION)):
+        parsed = json.loads(found)
         return {"name": str(parsed["name"]), "split": str(parsed["split"])}
 
 
-def log_build(root: str | pathlib.Path, line: dict[str, Any]) -> None:
-    """Appends a line to the build log: a job and its duration."""
-    append_line(pathlib.Path(root) / _LOG, line)
+def write_times(root: Where, action: str, template: str, line: dict[str, Any]) -> None:
+    """Stores what a garment of an action took: a file each, for many machines may write."""
+    write_file(join(root, _TIMES), f"{action}-{template}.json", json.dumps(line).encode())
 
 
-def read_log(root: str | pathlib.Path) -> list[dict[str, Any]]:
-    """The lines of the build log; incomplete lines are dropped."""
-    return read_lines(pathlib.Path(root) / _LOG)
+def read_times(root: Where) -> list[dict[str, Any]]:
+    """What each garment of each action took; damaged files are skipped."""
+    out = []
+    for name in list_files(join(root, _TIMES)):
+        with contextlib.suppress(ValueError, RecursionError):
+            out.append(json.loads(read_file(join(root, _TIMES), name) or b""))
+    return [line for line in out if isinstance(line, dict)]
 
 
-def _unfinished(path: pathlib.Path) -> bool:
-    return any(part.startswith(".") for part in path.parts)
-
-
-def dataset_digest(root: str | pathlib.Path) -> tuple[str, int]:
-    """Checksum of a dataset's files (build log excluded), and their size in bytes."""
-    root = pathlib.Path(root)
+def dataset_digest(root: Where) -> tuple[str, int]:
+    """Checksum of a dataset's files (times excluded), and their size in bytes."""
     total, size = hashlib.sha256(), 0
-    files = (p for p in root.rglob("*") if p.is_file() and p.name != _LOG)
-    for path in sorted(p for p in files if not _unfinished(p.relative_to(root))):
-        blob = path.read_bytes()
-        size += len(blob)
-        total.update(f"{path.relative_to(root)} {hashlib.sha256(blob).hexdigest()}\n".encode())
+    for name in list_files(root):
+        if name == _OLD_LOG or name.startswith(f"{_TIMES}/"):
+            continue
+        content = read_file(root, name) or b""
+        size += len(content)
+        total.update(f"{name} {hashlib.sha256(content).hexdigest()}\n".encode())
     return total.hexdigest(), size

@@ -6,6 +6,7 @@ from typing import Literal
 from jaxtyping import Array, Float, Int
 
 from ..body import Body, load_body
+from ..devices import prepared_on_processor
 from ..errors import PhysXNetError, WeightsError
 from ..garment import Garment, SkinnedGarment, make_skinned
 from ..models import (
@@ -81,6 +82,7 @@ class Dresser:
         return Outfit(self.body, self.rest, self.worn, self.garments)
 
 
+@prepared_on_processor
 def make_dresser(
     wear: Wear = ("top", "bottom"),
     *,
@@ -124,6 +126,7 @@ def make_dresser(
     )
 
 
+@prepared_on_processor
 def dress_garments(
     garments: list[Garment],
     notes: tuple[str, ...] = (),

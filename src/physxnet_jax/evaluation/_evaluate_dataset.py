@@ -2,12 +2,14 @@
 
 import collections
 import dataclasses
+import functools
 import pathlib
 from collections.abc import Callable, Mapping, Sequence as Items
 
-from ..data import Sequence, dataset_digest, list_sequences, read_sequence, usable_garment
+from ..data import Sequence, Where, dataset_digest, list_sequences, read_sequence, usable_garment
 from ..errors import FormatError, PhysXNetError
 from ..garment import Template
+from ..jobs import Job, run_jobs
 from ._baselines import nearest_frame, pose_network, training_frames
 from ._evaluate import ActionError, evaluate, retime
 from ._method_names import method_by_name
@@ -20,13 +22,14 @@ _TRAINED_BASELINES = ("nearest", "mlp")
 
 def evaluate_dataset(
     names: Items[str],
-    root: pathlib.Path,
+    root: Where,
     *,
     templates: Items[Template],
     split: str = "test",
-    train_data: pathlib.Path | None = None,
+    train_data: Where | None = None,
     out: pathlib.Path | None = None,
     times: bool = False,
+    ray: str | None = None,
     report: Callable[[str, int, int], None],
 ) -> list[ActionError]:
     """Measures methods on every action; saves each row as soon as it is complete.
@@ -39,6 +42,8 @@ def evaluate_dataset(
         train_data: Dataset that ``nearest`` and ``mlp`` learn from; ``root`` by default.
         out: File of the rows; existing ones are kept.
         times: Only measure the times of these methods' rows again.
+        ray: Address of a Ray cluster whose machines see the datasets, or ``local``, on which an
+            action is a job; None for this process. Times are then those of one core.
         report: Called with a stage, the steps done and the total.
 
     Returns:
@@ -63,6 +68,18 @@ def evaluate_dataset(
     training_root = train_data or root
     digests = {label: _digest(name, training_root) for name, label in labels.items()}
     _check_rows(rows, digests, sequences, out)
+    if ray is not None:
+        if times:
+            raise PhysXNetError("times are compared on one machine: leave out --ray.")
+        asked = (tuple(names), tuple(templates), training_root)
+        jobs = [
+            Job(s.name, _measure, (*asked, folder, [r for r in rows if r.action == s.name]))
+            for folder, s in zip(folders, sequences, strict=True)
+        ]
+        for _, new in run_jobs(jobs, ray=ray, report=report):
+            rows += [dataclasses.replace(row, weights=digests[row.method]) for row in new]
+            save_rows(out, rows)
+        return rows
     # A method whose rows are complete isn't loaded.
     methods = {
         label: _method(name, training_root, templates, report)
@@ -83,12 +100,29 @@ def evaluate_dataset(
     return rows
 
 
+def _measure(
+    names: tuple[str, ...],
+    templates: tuple[Template, ...],
+    training_root: Where,
+    folder: str,
+    done: list[ActionError],
+) -> list[ActionError]:
+    """The rows of an action that aren't done, in a process that may keep methods for the next."""
+    methods = {_label(n): _kept_method(n, training_root, templates) for n in names}
+    return list(evaluate(methods, [read_sequence(folder)], templates=templates, done=done))
+
+
+@functools.cache
+def _kept_method(name: str, training_root: Where, templates: tuple[Template, ...]) -> Method:
+    return _method(name, training_root, templates, lambda *_: None)
+
+
 def _label(name: str) -> str:
     """The name of a method; a run has the name of its folder, without the path."""
     return pathlib.Path(name).name
 
 
-def _digest(name: str, training_root: pathlib.Path) -> str:
+def _digest(name: str, training_root: Where) -> str:
     """The checksum of a network's weights, or of the dataset that a baseline learns from.
 
     Empty for other methods, and if the weights or the dataset are missing.
@@ -148,7 +182,7 @@ def _is_measured(
 
 def _method(
     name: str,
-    training_root: pathlib.Path,
+    training_root: Where,
     templates: Items[Template],
     report: Callable[[str, int, int], None],
 ) -> Method:

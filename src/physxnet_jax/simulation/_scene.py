@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import Body, load_body
+from ..devices import on_processor, prepared_on_processor
 from ..errors import SimulationError
 from ..garment import Garment
 from ._assembly import assemble, float32
@@ -123,16 +124,19 @@ def prepare_scene(scene: Scene) -> PreparedScene:
             f"An effect is listed twice: {[k.__name__ for k in kinds]}. List each only once."
         )
     body = load_body() if scene.body is None else scene.body
-    shape = body.default_shape() if scene.shape is None else scene.shape
-    assembly = assemble(scene.garments, body, shape)
-    # Pinned vertices have infinite mass only if the scene has `Pin`.
-    held = assembly.pinned if Pin in kinds else np.zeros_like(assembly.pinned)
-    inverse = np.where(held, 0.0, 1.0 / assembly.mass)
-    inverse_mass = jnp.asarray(inverse.astype(np.float32))
-    prepared = tuple(e.prepare(assembly, inverse_mass) for e in scene.effects)
+    # `make_system` moves the tables to the device.
+    with on_processor():
+        shape = body.default_shape() if scene.shape is None else scene.shape
+        assembly = assemble(scene.garments, body, shape)
+        # Pinned vertices have infinite mass only if the scene has `Pin`.
+        held = assembly.pinned if Pin in kinds else np.zeros_like(assembly.pinned)
+        inverse = np.where(held, 0.0, 1.0 / assembly.mass)
+        inverse_mass = jnp.asarray(inverse.astype(np.float32))
+        prepared = tuple(e.prepare(assembly, inverse_mass) for e in scene.effects)
     return PreparedScene(assembly, prepared, inverse_mass[:, None, None])
 
 
+@prepared_on_processor
 def make_system(scene: PreparedScene, solver: Solver) -> System:
     """Moves a scene to the device, in the solver's precision."""
     system = System(
