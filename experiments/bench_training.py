@@ -26,7 +26,7 @@ import numpy as np
 from rich.progress import Progress
 
 from physxnet_jax.body import load_body
-from physxnet_jax.data import Frames, Sequence, batch_indices, load_frames, take
+from physxnet_jax.data import Frames, Sequence, load_frames, take
 from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import TEMPLATES, template
 from physxnet_jax.models import PAPER, ModelConfig, Normalisation, Up
@@ -153,7 +153,7 @@ def main() -> None:
 
 def batch_of(frames: Frames, config: TrainConfig, step: int) -> tuple[dict, float]:
     began = time.perf_counter()
-    batch = take(frames, batch_indices(len(frames), config.batch, config.seed, step))
+    batch = take(frames, np.random.default_rng(step).permutation(len(frames))[: config.batch])
     return batch, time.perf_counter() - began
 
 

@@ -167,3 +167,64 @@ def test_preparation_computes_on_the_processor_and_results_are_on_the_default_de
     flags = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "JAX_PLATFORMS": "cpu"}
     command = [sys.executable, "-c", PREPARE]
     subprocess.run(command, env=os.environ | flags, check=True, timeout=240)
+
+
+SIMULATE = """
+import sys, csv, dataclasses, pathlib
+import jax, numpy as np
+from physxnet_jax.data import DatasetConfig, build_dataset, dataset_digest
+from physxnet_jax.garment import template
+from physxnet_jax.motion import load_motion, save_motion
+from physxnet_jax.simulation import (
+    XPBD, Scene, prepare_scene, simulate_batch
+)
+folder, devices = pathlib.Path(sys.argv[1]), len(jax.local_devices())
+clip = load_motion("punch", fps=30.0)
+def part(at, frames):
+    return dataclasses.replace(
+        clip, rotations=clip.rotations[at : at + frames], root=clip.root[at : at + frames]
+    )
+garment = template("bottom")
+scene = prepare_scene(Scene((garment,)))
+people = [part(0, 3), part(5, 4), part(9, 2)]
+solver = XPBD(8, 2)
+# Two at a time: with one person each, another program would run.
+if devices == 1:
+    out = [*simulate_batch(scene, people[:2], solver=solver)]
+    out += simulate_batch(scene, [people[2], people[2]], solver=solver)[:1]
+else:
+    out = simulate_batch(scene, people, solver=solver)
+assert [len(r.positions[0]) for r in out] == [3, 4, 2]
+values = {f"x{k}": r.positions[0] for k, r in enumerate(out)}
+values |= {f"d{k}{n}": v for k, r in enumerate(out) for n, v in r.diagnostics.items()}
+np.savez(folder / "out.npz", **values)
+mocap = folder / "mocap"
+mocap.mkdir()
+save_motion(mocap / "punch.npz", part(0, 40))
+with (mocap / "ACTIONS.csv").open("w", newline="") as file:
+    table = csv.writer(file)
+    table.writerow(["split", "action", "file", "start_s", "frames_at_30fps"])
+    table.writerows(["train", f"part {k}", "punch.npz", 0.3 * k, 5 + k] for k in range(3))
+config = DatasetConfig(splits=("train",), templates=("bottom",), people=2, solver=XPBD(8, 1))
+assert build_dataset(config, folder / "set", mocap) == 3
+(folder / "digest.txt").write_text(dataset_digest(folder / "set")[0])
+"""
+
+
+@pytest.mark.release
+def test_people_and_datasets_are_simulated_the_same_on_two_devices(tmp_path):
+    found = []
+    for devices in (1, 2):
+        folder = tmp_path / str(devices)
+        folder.mkdir()
+        flags = {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"}
+        command = [sys.executable, "-c", SIMULATE, str(folder)]
+        subprocess.run(command, env=os.environ | flags, check=True, timeout=400)
+        with np.load(folder / "out.npz") as data:
+            found.append({k: data[k] for k in data.files})
+        found[-1]["digest"] = (folder / "digest.txt").read_text()
+    one, two = found
+    assert one["digest"] == two["digest"]
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        np.testing.assert_array_equal(value, two[name], err_msg=name)

@@ -63,18 +63,19 @@ def join_processes(
     return jax.process_index()
 
 
-def make_mesh(batch: int, devices: int | None = None) -> Mesh:
+def make_mesh(batch: int, devices: int | None = None, *, local: bool = False) -> Mesh:
     """A mesh of devices that share a batch equally.
 
     Args:
         batch: Size of the batch.
         devices: Number of devices of each process; if None, as many as divide the batch.
+        local: Of this process alone.
 
     Raises:
         PhysXNetError: Fewer devices, or they don't divide the batch.
     """
     own = len(jax.local_devices())
-    processes = jax.process_count()
+    processes = 1 if local else jax.process_count()
     if devices is None:
         usable = [k for k in range(1, own + 1) if batch % (k * processes) == 0]
         devices = max(usable, default=1)
@@ -86,7 +87,7 @@ def make_mesh(batch: int, devices: int | None = None) -> Mesh:
             " number that divides it."
         )
     chosen = []
-    for process in range(processes):
+    for process in [jax.process_index()] if local else range(processes):
         chosen += [d for d in jax.devices() if d.process_index == process][:devices]
     return Mesh(np.asarray(chosen), (_AXIS,))
 

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import traceback
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -125,6 +126,10 @@ def _on_ray(jobs: Sequence[Job], address: str, report: Report | None) -> Iterato
 def _join(ray: Any, address: str) -> None:
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
-        ray.init(None if address == LOCAL else address, log_to_driver=False, logging_level="error")
+        with warnings.catch_warnings():
+            # Ray starts its programs, which run nothing of JAX, by forking.
+            warnings.filterwarnings("ignore", ".*os.fork.*", RuntimeWarning)
+            place = None if address == LOCAL else address
+            ray.init(place, log_to_driver=False, logging_level="error")
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise PhysXNetError(f"No Ray cluster at {address}: {error}") from error

@@ -425,7 +425,7 @@ def test_exploded_simulation_does_not_stop_a_build(tmp_path, monkeypatch):
     monkeypatch.setattr(_build, "simulate_batch", lambda *a, **k: [rollout])
     action = Action("train", "walk", "a.npz", 0.0, 3, None)
     config = DatasetConfig(templates=("top",))
-    _build._simulate(config, tmp_path, "top", (action,), tmp_path, None)
+    _build._simulate(config, tmp_path, "top", ((action,),), tmp_path, None)
     meta = read_sequence(tmp_path / "walk").meta["top"]
     assert not meta["finite"] and not usable_garment(meta)
     assert meta["worst"] == {"strain_max": pytest.approx(0.3)}
@@ -443,8 +443,8 @@ def test_action_begins_at_its_start_time(tmp_path):
 def test_shards_partition_the_actions(data_dir, tmp_path, monkeypatch):
     done = []
 
-    def note(config, root, name, group, *_):
-        done.extend(a.name for a in group)
+    def note(config, root, name, groups, *_):
+        done.extend(a.name for group in groups for a in group)
         return []
 
     monkeypatch.setattr(_build, "_simulate", note)

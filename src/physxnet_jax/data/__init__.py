@@ -5,7 +5,6 @@ from ._codec import make_codec as make_codec
 from ._config import CARD as CARD, DatasetConfig as DatasetConfig
 from ._frames import (
     Frames as Frames,
-    batch_indices as batch_indices,
     is_trainable as is_trainable,
     load_frames as load_frames,
     pose_windows as pose_windows,
@@ -32,4 +31,10 @@ from ._store import (
     write_action as write_action,
     write_garment as write_garment,
     write_offsets as write_offsets,
+)
+from ._stream import (
+    Batches as Batches,
+    Entry as Entry,
+    FrameStream as FrameStream,
+    read_entry as read_entry,
 )

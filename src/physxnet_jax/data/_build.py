@@ -109,18 +109,21 @@ def build_dataset(
     actions = [a for a in actions if not only or a.name in only]
     open_dataset(root, _note(config))
     own_groups = _groups(config, actions)[shard[0] :: shard[1]]
-    jobs = []
+    # A group for each device; a job on a cluster has one.
+    width = len(jax.local_devices()) if ray is None and config.engine == "physxnet" else 1
+    jobs, count = [], 0
     for name in config.templates:
-        for group in own_groups:
-            missing = sum(not is_stored(join(root, a.slug), name) for a in group)
-            label = f"{', '.join(a.name for a in group)}: {name}"
-            if missing:
-                job = Job(label, _simulate, (config, root, name, group, folder, ask))
-                jobs.append((job, missing))
-    for _, lines in run_jobs([job for job, _ in jobs], ray=ray, report=report):
+        stored = {a: is_stored(join(root, a.slug), name) for g in own_groups for a in g}
+        count += sum(not s for s in stored.values())
+        missing = [g for g in own_groups if not all(stored[a] for a in g)]
+        for at in range(0, len(missing), width):
+            groups = tuple(missing[at : at + width])
+            label = f"{', '.join(a.name for g in groups for a in g)}: {name}"
+            jobs.append(Job(label, _simulate, (config, root, name, groups, folder, ask)))
+    for _, lines in run_jobs(jobs, ray=ray, report=report):
         for slug, line in lines:
             write_times(root, slug, line["template"], line)
-    return sum(missing for _, missing in jobs)
+    return count
 
 
 def expected_frames(root: Where, folder: str | pathlib.Path) -> dict[str, int]:
@@ -184,11 +187,12 @@ def _simulate(
     config: DatasetConfig,
     root: Where,
     name: Template,
-    group: tuple[Action, ...],
+    groups: tuple[tuple[Action, ...], ...],
     folder: pathlib.Path,
     ask: Ask | None,
 ) -> list[tuple[str, dict[str, Any]]]:
-    """Stores a garment in a group of actions; returns what each took."""
+    """Stores a garment in groups of actions, one for each device; returns what each took."""
+    group = tuple(action for g in groups for action in g)
     scene = _prepared(name)
     assembly = scene.assembly
     write_garment(root, name, assembly.rest, np.asarray(assembly.faces))
@@ -206,7 +210,11 @@ def _simulate(
         one = Scene((template(name),))
         rollouts = [simulate_blender(one, m, settings=config.blender) for m in motions]
     else:
-        rollouts = simulate_batch(scene, motions, solver=config.solver)
+        # Every group has the same size, since another size is another program.
+        places = [group.index(a) for g in groups for a in (*g, *(config.people - len(g)) * g[-1:])]
+        batch = [motions[k] for k in places]
+        every = simulate_batch(scene, batch, solver=config.solver, devices=len(groups))
+        rollouts = [every[places.index(k)] for k in range(len(group))]
     seconds = round((time.perf_counter() - start) / len(group), 2)
     lines = []
     for action, motion, rollout in zip(group, motions, rollouts):

@@ -1,8 +1,9 @@
-"""Training frames in memory, and batches that depend on the step number alone."""
+"""Training frames in memory."""
 
 import dataclasses
 import hashlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,7 +42,7 @@ _CHUNK = 16
 
 @dataclasses.dataclass(frozen=True)
 class Frames:
-    """All training frames.
+    """Training frames in memory.
 
     Attributes:
         rotations: World rotations of joints over each frame's window, shape
@@ -50,7 +51,6 @@ class Frames:
         targets: For each template, cloth offsets [0.1 mm], shape [frames, vertices, 3].
         usable: For each template, which frames are usable, shape [frames].
         fps: Frames per second.
-        identity: Names, lengths and content hashes of the sequences; ties a run to its data.
     """
 
     rotations: Float[np.ndarray, "frames window joints 3 3"]
@@ -58,7 +58,6 @@ class Frames:
     targets: dict[str, np.ndarray]
     usable: dict[str, Bool[np.ndarray, " frames"]]
     fps: float
-    identity: str
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -98,7 +97,7 @@ def load_frames(
     Raises:
         FormatError: No sequences, or sequences of different frame rates.
     """
-    rotations, translations, hashes = [], [], []
+    rotations, translations = [], []
     rates: set[float] = set()
     targets: dict[str, list] = {t: [] for t in garments}
     usable: dict[str, list] = {t: [] for t in garments}
@@ -106,7 +105,6 @@ def load_frames(
         rates.add(s.motion.fps)
         if len(rates) != 1:
             raise FormatError(f"sequences of different frame rates: {sorted(rates)}.")
-        hashes.append(f"{s.name} {s.motion.num_frames} {_content_hash(s)}")
         world, shift = clip_transforms(body, rest, s.motion)
         rotations.append(np.asarray(pose_windows(world, window)))
         translations.append(np.asarray(pose_windows(shift, window)))
@@ -120,7 +118,7 @@ def load_frames(
             if local:
                 offset = _to_local(g, world, offset)
             targets[name].append(np.round(offset / QUANTIZATION_STEP).astype(np.int16))
-    if not hashes:
+    if not rotations:
         raise FormatError("no sequence to train on; build a dataset first.")
     cat = np.concatenate
     return Frames(
@@ -130,17 +128,17 @@ def load_frames(
         {t: cat(targets.pop(t)) for t in garments},
         {t: cat(v) for t, v in usable.items()},
         rates.pop(),
-        ", ".join(hashes),
     )
 
 
-def _content_hash(sequence: Sequence) -> str:
-    """A short hash of a sequence's cloth, from the dataset's checksums where it stores them."""
+def content_hash(meta: Mapping[str, Any], offsets: Mapping[str, np.ndarray] | None) -> str:
+    """A short hash of an action's cloth, from the dataset's checksums where it stores them."""
     digest = hashlib.sha256()
-    for name, offsets in sorted(sequence.offsets.items()):
-        hashes = sequence.meta[name].get("sha256")
-        hashes = hashlib.sha256(offsets.tobytes()).hexdigest() if hashes is None else hashes
-        digest.update(f"{name} {hashes}\n".encode())
+    for name in sorted(meta if offsets is None else offsets):
+        known = meta[name].get("sha256")
+        if known is None and offsets is not None:
+            known = hashlib.sha256(offsets[name].tobytes()).hexdigest()
+        digest.update(f"{name} {known}\n".encode())
     return digest.hexdigest()[:8]
 
 
@@ -169,14 +167,6 @@ def _rotate_back(skin: Array, world: Array, offset: Array) -> Array:
         )
 
     return jax.vmap(one)(world, offset)
-
-
-def batch_indices(num_frames: int, batch: int, seed: int, step: int) -> np.ndarray:
-    """Frames of a step: a new permutation every epoch, determined by the step alone."""
-    per_epoch = max(num_frames // batch, 1)
-    epoch, at = divmod(step, per_epoch)
-    order = np.random.default_rng([seed, epoch]).permutation(num_frames)
-    return np.resize(order[at * batch : (at + 1) * batch], batch)
 
 
 def take(frames: Frames, index: np.ndarray) -> dict[str, np.ndarray]:

@@ -352,17 +352,19 @@ def read_sequence(folder: Where) -> Sequence:
     Raises:
         FormatError: The folder doesn't hold an action.
     """
+    name, motion, meta = read_meta_of_all(folder)
+    offsets = {t: read_offsets(folder, t) for t in meta}
+    return Sequence(name, _action_note(folder)["split"], motion, offsets, meta)
+
+
+def read_meta_of_all(folder: Where) -> tuple[str, Motion, dict[str, dict[str, Any]]]:
+    """Name, motion and each garment's metadata of an action; its cloth isn't read."""
     info = _action_note(folder)
     # The description of an array is written last: what lacks it is in progress or interrupted.
     parts = [name.split("/") for name in list_files(folder)]
     found = [p[0] for p in parts if p[1:] == [_ARRAY]]
-    return Sequence(
-        info["name"],
-        info["split"],
-        _read_motion(folder, info["name"]),
-        {name: read_offsets(folder, name) for name in found},
-        {name: read_meta(folder, name) for name in found},
-    )
+    name = info["name"]
+    return name, _read_motion(folder, name), {t: read_meta(folder, t) for t in found}
 
 
 def list_sequences(root: Where, split: str | None = None) -> list[str]:

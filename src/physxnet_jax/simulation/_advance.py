@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Float
 
 from ._effect import Clock, PosedPoints
@@ -143,6 +144,75 @@ def advance(
         jax.checkpoint(frame), (state, first, start_time), (rotations[1:], root[1:])
     )
     return state, positions, diagnostics
+
+
+def advance_on(
+    mesh: Mesh,
+    system: System,
+    state: State,
+    rotations: Float[Array, "frames batch joints 4"],
+    root: Float[Array, "frames batch 3"],
+    *,
+    solver: Solver,
+    fps: float,
+    time: Float[Array, ""],
+    energies: bool = False,
+) -> tuple[State, Float[Array, "later vertices 3 batch"], dict[str, Array]]:
+    """`advance` with the people split among the devices of a mesh.
+
+    Each device runs the program of its share, so that the result doesn't depend on their number.
+    """
+    if mesh.size == 1:
+        return advance(
+            system, state, rotations, root, solver=solver, fps=fps, time=time, energies=energies
+        )
+    return _advance_shares(
+        system,
+        state,
+        rotations,
+        root,
+        time,
+        mesh=mesh,
+        solver=solver,
+        fps=fps,
+        energies=energies,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("mesh", "solver", "fps", "energies"))
+def _advance_shares(
+    system: System,
+    state: State,
+    rotations: Float[Array, "frames batch joints 4"],
+    root: Float[Array, "frames batch 3"],
+    time: Float[Array, ""],
+    *,
+    mesh: Mesh,
+    solver: Solver,
+    fps: float,
+    energies: bool,
+) -> tuple[State, Float[Array, "later vertices 3 batch"], dict[str, Array]]:
+    (axis,) = mesh.axis_names
+
+    # People are the last axis of every array of the state.
+    def share(x: Array) -> PartitionSpec:
+        return PartitionSpec(*[None] * (x.ndim - 1), axis) if x.ndim else PartitionSpec()
+
+    def run(*arguments: Any) -> Any:
+        *inputs, at = arguments
+        return advance(*inputs, solver=solver, fps=fps, time=at, energies=energies)
+
+    whole, frames_first = PartitionSpec(), PartitionSpec(None, axis)
+    shares = jax.tree.map(share, state)
+    # Nothing passes between devices; the loops' first carries are constants, which the check of
+    # what varies among devices doesn't accept.
+    return jax.shard_map(
+        run,
+        mesh=mesh,
+        in_specs=(whole, shares, frames_first, frames_first, whole),
+        out_specs=(shares, PartitionSpec(None, None, None, axis), frames_first),
+        check_vma=False,
+    )(system, state, rotations, root, time)
 
 
 def _diagnose(

@@ -7,13 +7,15 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 from scipy.spatial.transform import Rotation, Slerp
 
 from .._environment import clear_caches_if_full
 from ..body import Body
+from ..devices import make_mesh
 from ..errors import SimulationError
 from ..motion import Motion, animate
-from ._advance import advance, start_state
+from ._advance import advance_on, start_state
 from ._assembly import float32
 from ._diagnostics import Rollout
 from ._prepared_scene import PreparedScene
@@ -130,8 +132,12 @@ def simulate_batch(
     progress: Callable[[int, int], None] | None = None,
     energies: bool = False,
     resume: str | pathlib.Path | None = None,
+    devices: int | None = None,
 ) -> list[Rollout]:
     """Simulates several motions as one batch; each result has its motion's length.
+
+    On several devices each simulates an equal share of the people; a person's result is then that
+    of a batch of such a share.
 
     Args:
         scene: The prepared scene.
@@ -141,6 +147,7 @@ def simulate_batch(
         energies: Include the energy of each effect in the diagnostics.
         resume: Folder for finished blocks. The same call resumes from them after an
             interruption and removes them at the end. If None, nothing is stored.
+        devices: Devices of this machine to use; all of them by default, but one for each person.
 
     Returns:
         One rollout per motion.
@@ -148,14 +155,19 @@ def simulate_batch(
     Raises:
         SimulationError: No motion, motions of different frame rates, or a folder that
             belongs to another rollout.
+        PhysXNetError: This machine has fewer devices.
     """
     if not motions:
         raise SimulationError("No motion to simulate; pass at least one.")
     clear_caches_if_full()
+    used = min(len(jax.local_devices()), len(motions)) if devices is None else devices
+    missing = -len(motions) % used
+    mesh = make_mesh(len(motions) + missing, used, local=True)
+    padded = [*motions, *missing * motions[-1:]]
     solver = PRESETS["standard"].at_rate(motions[0].fps) if solver is None else solver
     # Limited to tracing and execution: the rest of the process keeps its precision.
     with jax.enable_x64(solver.precision == "float64"):
-        return _roll(scene, motions, solver, progress, energies, resume)
+        return _roll(scene, padded, solver, progress, energies, resume, mesh)[: len(motions)]
 
 
 def _roll(
@@ -165,6 +177,7 @@ def _roll(
     progress: Callable[[int, int], None] | None,
     energies: bool,
     resume: str | pathlib.Path | None,
+    mesh: Mesh,
 ) -> list[Rollout]:
     fps = motions[0].fps
     if any(m.fps != fps for m in motions):
@@ -209,7 +222,8 @@ def _roll(
         state, positions, diagnostics = store.load(state)
     for at in range(ROLLOUT_BLOCK * len(positions), total - 1, ROLLOUT_BLOCK):
         part = slice(at, at + ROLLOUT_BLOCK + 1)
-        state, new_positions, info = advance(
+        state, new_positions, info = advance_on(
+            mesh,
             system,
             state,
             jnp.asarray(rotations[part]),

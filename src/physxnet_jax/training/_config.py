@@ -46,6 +46,8 @@ class TrainConfig:
         validate_every: Steps between validations.
         patience: Stop after this many validations without improvement.
         checkpoint_every: Steps between checkpoints.
+        frames_in_memory: Frames of cloth in memory. A larger dataset is read while it is learned
+            from, half as many frames at a time, in another order every epoch.
         max_skipped: Abort after this many consecutive non-finite updates.
     """
 
@@ -72,11 +74,12 @@ class TrainConfig:
     validate_every: int = 400
     patience: int = 10
     checkpoint_every: int = 200
+    frames_in_memory: int = 20_000
     max_skipped: int = 20
 
     def __post_init__(self) -> None:
         check_counts(self, "epochs", "batch", "discriminator_width", "validate_every")
-        check_counts(self, "patience", "checkpoint_every", "max_skipped")
+        check_counts(self, "patience", "checkpoint_every", "frames_in_memory", "max_skipped")
         check_numbers(self, "learning_rate", "discriminator_rate", "muon_learning_rate")
         check_numbers(self, "l1_weight", zero=True)
         if not 0.0 <= self.b1 < 1.0:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import itertools
 import json
 import pathlib
 import time
@@ -16,7 +15,18 @@ from flax import nnx
 from jax.sharding import Mesh
 
 from ..body import load_body
-from ..data import Frames, Sequence, batch_indices, load_frames, mirrored_sequence, take
+from ..data import (
+    Batches,
+    Entry,
+    Frames,
+    FrameStream,
+    Sequence,
+    Where,
+    load_frames,
+    mirrored_sequence,
+    read_entry,
+    take,
+)
 from ..devices import at_home, make_mesh, own_rows, repeated, split
 from ..errors import FormatError, PhysXNetError
 from ..files import append_line, atomic_write
@@ -39,7 +49,7 @@ _Report = Callable[[int, int, dict[str, float]], None]
 
 def train(
     config: TrainConfig,
-    sequences: Items[Sequence],
+    sequences: Items[Sequence | Where],
     folder: str | pathlib.Path,
     *,
     network: nnx.Module | None = None,
@@ -53,7 +63,8 @@ def train(
 
     Args:
         config: Settings of the run.
-        sequences: Simulated actions, including those of ``config.validation``.
+        sequences: Simulated actions, including those of ``config.validation``: their folders from
+            `list_sequences`, which are read while others are learned from, or the actions.
         folder: Folder for checkpoints and ``metrics.jsonl``.
         network: Any module with the signature of `Generator`; a `Generator` by default.
         loss: Any function of `LossInputs`; `configured_loss` by default.
@@ -76,7 +87,7 @@ def train(
     folder.mkdir(parents=True, exist_ok=True)
     mesh = make_mesh(config.batch, devices)
     data = _load_data(config, sequences)
-    total = max(len(data.frames) // config.batch, 1) * config.epochs
+    total = data.frames.steps_per_epoch * config.epochs
     problem, first = make_problem(
         config,
         data.atlas,
@@ -102,7 +113,7 @@ def train(
 class _Data:
     """Frames to learn from, and the tables and scales that come with them."""
 
-    frames: Frames
+    frames: FrameStream
     unseen: Frames | None
     atlas: Atlas
     texel_points: TexelPoints
@@ -110,15 +121,16 @@ class _Data:
     normalisation: Normalisation
 
 
-def _load_data(config: TrainConfig, sequences: Items[Sequence]) -> _Data:
+def _load_data(config: TrainConfig, sequences: Items[Sequence | Where]) -> _Data:
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
     garments = {t: template(t) for t in config.model.templates}  # pyright: ignore[reportArgumentType]
     atlas, texel_points, tables = prepare_targets(config.model)
-    held = _held_out(config, sequences)
-    used = [s for s in sequences if s.name not in config.validation]
-    # One at a time: each is as large as its original.
-    images = (mirrored_sequence(body, s) for s in used if config.mirror_augmentation)
+    entries = [read_entry(s) for s in sequences]
+    held = [e.read() for e in _held_out(config, entries)]
+    used = [e for e in entries if e.name not in config.validation]
+    if config.mirror_augmentation:
+        used += [dataclasses.replace(e, mirrored=True) for e in used]
     load = functools.partial(
         load_frames,
         garments=garments,
@@ -127,7 +139,14 @@ def _load_data(config: TrainConfig, sequences: Items[Sequence]) -> _Data:
         window=config.model.inputs.window,
         local=config.model.family == "local",
     )
-    frames = load(itertools.chain(used, images))
+    frames = FrameStream(
+        used,
+        load,
+        functools.partial(mirrored_sequence, body),
+        batch=config.batch,
+        seed=config.seed,
+        capacity=config.frames_in_memory,
+    )
     unseen = load(held) if held else None
     if unseen is not None and not any(x.any() for x in unseen.usable.values()):
         raise FormatError(
@@ -140,7 +159,7 @@ def _load_data(config: TrainConfig, sequences: Items[Sequence]) -> _Data:
         texel_points=texel_points,
         tables=tables,
         normalisation=measure_normalisation(
-            frames, texel_points, tables, config.model.family, seed=config.seed
+            frames.first(), texel_points, tables, config.model.family, seed=config.seed
         ),
     )
 
@@ -194,11 +213,24 @@ class _Run:
             if report is not None:
                 report(self._done, stop, values)
 
-        frames = self._data.frames
+        batches = self._data.frames.batches(self._done, own_rows(config.batch))
+        try:
+            self._steps(stop, batches, key, log)
+        finally:
+            batches.close()
+
+    def _steps(
+        self,
+        stop: int,
+        batches: Batches,
+        key: jax.Array,
+        log: Callable[[dict[str, float]], None],
+    ) -> None:
+        config = self._config
+        began, waited = time.perf_counter(), batches.waited
         while self._done < stop and not self._stopping.exhausted:
-            index = batch_indices(len(frames), config.batch, config.seed, self._done)
             step_key = jax.random.fold_in(key, self._done)
-            batch = split(self._mesh, take(frames, index[own_rows(len(index))]))
+            batch = split(self._mesh, next(batches))
             try:
                 self._state, metrics = train_step(self._problem, self._state, batch, step_key)
                 self._done += 1
@@ -213,6 +245,9 @@ class _Run:
                 ) from error
             if self._done % 20 == 0 or self._done == stop:
                 values = {k: float(v) for k, v in metrics.items()}
+                now = time.perf_counter()
+                values["waiting_share"] = (batches.waited - waited) / (now - began)
+                began, waited = now, batches.waited
                 log(values | self._gan.update(values))
             # Only on schedule, so that an interrupted run stays identical.
             if self._done % config.validate_every == 0 or self._done == self._total:
@@ -256,7 +291,7 @@ class _Run:
         self._best.close()
 
 
-def _held_out(config: TrainConfig, sequences: Items[Sequence]) -> list[Sequence]:
+def _held_out(config: TrainConfig, sequences: Items[Entry]) -> list[Entry]:
     names = {s.name for s in sequences}
     missing = [n for n in config.validation if n not in names]
     if missing:
