@@ -20,7 +20,7 @@ import numpy as np
 from physxnet_jax.devices import join_processes
 folder, devices, number, port = sys.argv[1], int(sys.argv[2]), sys.argv[3], sys.argv[4]
 if number != "alone":
-    join_processes("127.0.0.1:" + port, 2, int(number))
+    join_processes("127.0.0.1:" + port, 2, int(number), patience=30)
 import jax, optax
 from physxnet_jax.data import Sequence
 from physxnet_jax.garment import template
@@ -36,7 +36,7 @@ offsets = (base[None] + rng.normal(0, 1e-3, (24, 1, 3))).astype(np.float32)
 meta = {"bottom": {"finite": True, "worst": {"penetration_max": 0.0}}}
 data = [Sequence(name, "train", motion, {"bottom": offsets}, meta) for name in ("walk", "held")]
 config = TrainConfig(
-    model=ModelConfig(resolution=32, width=4, templates=("bottom",)), epochs=8, batch=4,
+    model=ModelConfig(resolution=32, width=4, templates=("bottom",)), epochs=int(sys.argv[7]), batch=4,
     discriminator_width=4, checkpoint_every=10, validation=("held",), validate_every=10,
     adversarial=False,
 )
@@ -48,10 +48,10 @@ if number in ("alone", "0"):
 """
 
 
-def start(folder, *, devices=1, number="alone", port=0, optimizer="sgd", steps=20):
+def start(folder, *, devices=1, number="alone", port=0, optimizer="sgd", steps=20, epochs=8):
     """A process of its own, since devices are chosen once for each."""
     flags = f"--xla_force_host_platform_device_count={devices}"
-    words = [str(folder), str(devices), number, str(port), optimizer, str(steps)]
+    words = [str(folder), str(devices), number, str(port), optimizer, str(steps), str(epochs)]
     return subprocess.Popen(
         [sys.executable, "-c", PROGRAM, *words],
         env=os.environ | {"XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu"},

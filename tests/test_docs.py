@@ -240,6 +240,21 @@ def test_reproduction_page_matches_the_measurements():
         assert card["licence"] and card["acknowledgement"]
 
 
+def test_scaling_tables_match_the_measurements():
+    text = (ROOT / "docs/scale.md").read_text()
+    for name in ("scaling", "scale"):
+        part = text.partition(f"<!-- begin {name} -->\n")[2].partition(f"<!-- end {name} -->")[0]
+        assert part == (ROOT / f"experiments/results/{name}.md").read_text()
+    found = json.loads((ROOT / "experiments/results/scaling.json").read_text())
+    made = runpy.run_path(str(ROOT / "experiments/scaling.py"))
+    assert made["tables"](found) == (ROOT / "experiments/results/scaling.md").read_text()
+    assert made["cost_table"](found) == (ROOT / "experiments/results/scale.md").read_text()
+    # As the page says.
+    assert all(r["share"] < 0.05 for r in found["pipeline"])
+    pairs = [r for r in found["rows"] if r["processes"] == 2 and "64 x 64" not in r["what"]]
+    assert len(pairs) == 3 and all(r["efficiency"] > 0.85 and r["same_result"] for r in pairs)
+
+
 def test_wardrobe_table_matches_the_measurements():
     text = (ROOT / "docs/garments.md").read_text()
     part = text.partition("<!-- begin wardrobe -->\n")[2].partition("<!-- end wardrobe -->")[0]

@@ -19,14 +19,14 @@ _T = TypeVar("_T")
 _AXIS = "batch"
 # Variables in which a launcher says how many processes it started: srun, mpirun.
 _LAUNCHERS = ("SLURM_STEP_NUM_TASKS", "OMPI_COMM_WORLD_SIZE")
-# A process that hasn't been heard of for this long has ended [s].
-_PATIENCE = 60
 
 
 def join_processes(
     coordinator: str | None = None,
     num_processes: int | None = None,
     process_id: int | None = None,
+    *,
+    patience: int = 60,
 ) -> int:
     """Joins the processes of a run, which may be on several machines.
 
@@ -37,6 +37,7 @@ def join_processes(
         coordinator: Address of the first process, ``HOST:PORT``.
         num_processes: Number of processes.
         process_id: This one's number, from 0.
+        patience: A process that hasn't been heard of for so long has ended [s].
 
     Returns:
         This process's number.
@@ -56,10 +57,13 @@ def join_processes(
     try:
         jax.config.update("jax_cpu_collectives_implementation", "gloo")
         jax.distributed.initialize(
-            coordinator, num_processes, process_id, heartbeat_timeout_seconds=_PATIENCE
+            coordinator, num_processes, process_id, heartbeat_timeout_seconds=patience
         )
     except (RuntimeError, ValueError) as error:
         raise PhysXNetError(f"The processes didn't meet at {coordinator}: {error}") from error
+    if jax.default_backend() == "cpu":
+        # A process that loads a program from the cache may wait for ever in XLA once others joined.
+        jax.config.update("jax_enable_compilation_cache", False)
     return jax.process_index()
 
 

@@ -40,7 +40,8 @@ def run_jobs(
 ) -> Iterator[tuple[Job, Any]]:
     """Runs jobs, and yields each with its result as it finishes.
 
-    In this process they run one after another, and an error ends them. On Ray each takes one core;
+    In this process they run one after another, and an error ends them. On Ray each takes one core,
+    and one GPU if the cluster has any;
     lost workers and machines are replaced, a job that raises is tried once more, and those that
     raise twice are reported together when all others are done.
 
@@ -92,8 +93,14 @@ def _on_ray(jobs: Sequence[Job], address: str, report: Report | None) -> Iterato
         _join(ray, address)
     # XLA starts a thread for each core of the machine, but a job has one core.
     environment = {"env_vars": {"NPROC": "1"}}
+    # With accelerators in the cluster a job is for one of them.
+    cards = 1 if ray.cluster_resources().get("GPU", 0) else 0
     run = ray.remote(
-        num_cpus=1, max_retries=_LOSSES, retry_exceptions=False, runtime_env=environment
+        num_cpus=1,
+        num_gpus=cards,
+        max_retries=_LOSSES,
+        retry_exceptions=False,
+        runtime_env=environment,
     )(_attempt)
     waiting = {run.remote(job.function, job.arguments): job for job in jobs}
     failed: list[str] = []

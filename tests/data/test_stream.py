@@ -7,8 +7,18 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from physxnet_jax.data import Entry, Frames, FrameStream, Sequence, read_entry, write_action
-from physxnet_jax.data._store import write_garment, write_offsets
+from physxnet_jax.data import (
+    Entry,
+    Frames,
+    FrameStream,
+    Sequence,
+    dataset_digest,
+    list_entries,
+    read_entry,
+    write_action,
+)
+from physxnet_jax.data._store import remove_index, write_garment, write_offsets
+from physxnet_jax.data._stream import index_dataset
 from physxnet_jax.errors import FormatError
 from physxnet_jax.garment import template
 from physxnet_jax.motion import load_motion
@@ -164,3 +174,26 @@ def test_memory_does_not_grow_with_the_dataset(tmp_path):
     # The control: all of them in memory, with two bytes a coordinate.
     held = 2e-6 * 16 * 40 * garment.num_vertices * 3
     assert peaks[16, 10_000] > peaks[16, 80] + 0.5 * held
+
+
+def test_index_lists_what_the_actions_say(tmp_path):
+    garment, motion = template("bottom"), load_motion("walk", fps=30.0)
+    write_garment(
+        tmp_path, "bottom", np.asarray(garment.mesh.vertices), np.asarray(garment.mesh.faces)
+    )
+    offsets = np.zeros((motion.num_frames, garment.num_vertices, 3), np.float32)
+    for name, split in (("walk", "train"), ("other", "test")):
+        write_action(tmp_path / name, dataclasses.replace(motion, name=name), split)
+        write_offsets(tmp_path / name, "bottom", offsets, {"finite": True, "worst": {}})
+    looked = list_entries(tmp_path)
+    before = dataset_digest(tmp_path)
+    index_dataset(tmp_path)
+    assert list_entries(tmp_path) == looked and [e.name for e in looked] == ["other", "walk"]
+    assert [e.name for e in list_entries(tmp_path, "train")] == ["walk"]
+    assert dataset_digest(tmp_path) == before
+    (tmp_path / "index.json").write_text("[3]")
+    with pytest.raises(FormatError, match="damaged"):
+        list_entries(tmp_path)
+    remove_index(tmp_path)
+    remove_index(tmp_path)
+    assert list_entries(tmp_path) == looked

@@ -4,7 +4,7 @@ import math
 
 from rich.console import Console
 
-from ..data import CARD, list_sequences, read_entry, read_note
+from ..data import CARD, list_entries, read_note
 from ..devices import join_processes
 from ..models import save_predictor
 from ..training import TrainConfig, read_metrics, train as run
@@ -20,11 +20,11 @@ def train(command: Train, console: Console) -> int:
     """Starts or resumes training; writes the weights to the run's folder."""
     first = join_processes(command.coordinator, command.num_processes, command.process_id) == 0
     config = read_config(command.config, TrainConfig)
-    folders = [
-        folder
+    entries = [
+        entry
         for root in command.data
         for split in command.splits
-        for folder in list_sequences(root, split)
+        for entry in list_entries(root, split)
     ]
     with progress_bars(console) as progress:
 
@@ -37,7 +37,7 @@ def train(command: Train, console: Console) -> int:
 
         predictor = run(
             config,
-            folders,
+            entries,
             command.out,
             steps=command.steps,
             devices=command.devices,
@@ -46,7 +46,7 @@ def train(command: Train, console: Console) -> int:
     if not first:
         return 0
     log = read_metrics(command.out)
-    entries = [e for e in map(read_entry, folders) if e.name not in config.validation]
+    used = [e for e in entries if e.name not in config.validation]
     measured = [x for x in log if math.isfinite(x.get("validation_mm", math.nan))]
     alarms = sum(line.get("gan_alarm", 0.0) for line in log)
     notes = [read_note(root) for root in command.data]
@@ -57,8 +57,8 @@ def train(command: Train, console: Console) -> int:
             for n in notes
         ],
         "training": {
-            "actions": len(entries),
-            "frames": sum(e.frames for e in entries),
+            "actions": len(used),
+            "frames": sum(e.frames for e in used),
             "steps": int(log[-1]["step"]) if log else 0,
             **(
                 {

@@ -36,5 +36,6 @@ from ._stream import (
     Batches as Batches,
     Entry as Entry,
     FrameStream as FrameStream,
+    list_entries as list_entries,
     read_entry as read_entry,
 )

@@ -35,11 +35,13 @@ from ._store import (
     is_stored,
     open_dataset,
     read_note,
+    remove_index,
     write_action,
     write_garment,
     write_offsets,
     write_times,
 )
+from ._stream import index_dataset
 
 Ask = Callable[[Motion, Template], np.ndarray]
 """Predicts a garment's vertices [m]."""
@@ -120,9 +122,13 @@ def build_dataset(
             groups = tuple(missing[at : at + width])
             label = f"{', '.join(a.name for g in groups for a in g)}: {name}"
             jobs.append(Job(label, _simulate, (config, root, name, groups, folder, ask)))
+    if jobs:
+        remove_index(root)
     for _, lines in run_jobs(jobs, ray=ray, report=report):
         for slug, line in lines:
             write_times(root, slug, line["template"], line)
+    # Of several shards the last one lists all.
+    index_dataset(root)
     return count
 
 

@@ -47,6 +47,11 @@ def write_file(where: str | pathlib.Path, name: str, content: bytes) -> None:
         raise FormatError(f"{join(where, name)} can't be written: {error}") from error
 
 
+def remove_file(where: str | pathlib.Path, name: str) -> None:
+    """Removes a file, if there is one."""
+    _opened(str(where)).delete_range(ts.KvStore.KeyRange(name, f"{name}\0")).result()
+
+
 def list_files(where: str | pathlib.Path) -> list[str]:
     """Files below a folder, sorted by their parts; nothing that begins with a dot."""
     names = [key.decode() for key in _opened(str(where)).list().result()]

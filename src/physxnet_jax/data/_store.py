@@ -24,7 +24,7 @@ from ..errors import FormatError
 from ..files import read_arrays
 from ..motion import Motion, make_motion
 from ._codec import Codec, make_codec
-from ._files import join, last_name, list_files, open_array, read_file, write_file
+from ._files import join, last_name, list_files, open_array, read_file, remove_file, write_file
 
 Where = str | pathlib.Path
 """A path or a URL."""
@@ -37,6 +37,8 @@ _MAX_COORDINATES = 3e8
 _NOTE, _ACTION, _ARRAY, _MOTION = "dataset.json", "action.json", "zarr.json", "motion.npz"
 # Timings differ between runs: they aren't part of the dataset's digest.
 _TIMES, _OLD_LOG = "times", "build_log.jsonl"
+# Derived from the rest, so that it isn't part of the digest either.
+_INDEX = "index.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -383,6 +385,25 @@ def _action_note(folder: Where) -> dict[str, str]:
         return {"name": str(parsed["name"]), "split": str(parsed["split"])}
 
 
+def write_index(root: Where, lines: list[dict[str, Any]]) -> None:
+    """Stores what `read_index` returns."""
+    write_file(root, _INDEX, json.dumps(lines).encode())
+
+
+def read_index(root: Where) -> list[dict[str, Any]] | None:
+    """A line for each action, or None if none is stored or actions were added since."""
+    found = read_file(root, _INDEX)
+    if found is None:
+        return None
+    with _report_damage(join(root, _INDEX)):
+        return [_as_dict(line) for line in json.loads(found)]
+
+
+def remove_index(root: Where) -> None:
+    """Removes the index, before what it lists changes."""
+    remove_file(root, _INDEX)
+
+
 def write_times(root: Where, action: str, template: str, line: dict[str, Any]) -> None:
     """Stores what a garment of an action took: a file each, for many machines may write."""
     write_file(join(root, _TIMES), f"{action}-{template}.json", json.dumps(line).encode())
@@ -398,10 +419,10 @@ def read_times(root: Where) -> list[dict[str, Any]]:
 
 
 def dataset_digest(root: Where) -> tuple[str, int]:
-    """Checksum of a dataset's files (times excluded), and their size in bytes."""
+    """Checksum of a dataset's files (times and index excluded), and their size in bytes."""
     total, size = hashlib.sha256(), 0
     for name in list_files(root):
-        if name == _OLD_LOG or name.startswith(f"{_TIMES}/"):
+        if name in (_OLD_LOG, _INDEX) or name.startswith(f"{_TIMES}/"):
             continue
         content = read_file(root, name) or b""
         size += len(content)

@@ -12,8 +12,18 @@ import numpy as np
 from jaxtyping import Int
 
 from ..errors import FormatError
+from ._config import SPLITS
+from ._files import join, last_name
 from ._frames import Frames, content_hash, take
-from ._store import Sequence, Where, read_meta_of_all, read_sequence
+from ._store import (
+    Sequence,
+    Where,
+    list_sequences,
+    read_index,
+    read_meta_of_all,
+    read_sequence,
+    write_index,
+)
 
 _Load = Callable[[Iterator[Sequence]], Frames]
 # Batches that are ready before they are needed.
@@ -45,13 +55,47 @@ class Entry:
         return self.source if isinstance(self.source, Sequence) else read_sequence(self.source)
 
 
-def read_entry(source: Where | Sequence) -> Entry:
+def read_entry(source: Where | Sequence | Entry) -> Entry:
     """The entry of a stored action, or of one in memory."""
+    if isinstance(source, Entry):
+        return source
     if isinstance(source, Sequence):
         motion, content = source.motion, content_hash(source.meta, source.offsets)
         return Entry(source.name, motion.num_frames, motion.fps, content, source)
     name, motion, meta = read_meta_of_all(source)
     return Entry(name, motion.num_frames, motion.fps, content_hash(meta, None), source)
+
+
+def list_entries(root: Where, split: str | None = None) -> list[Entry]:
+    """The entries of a dataset's actions, optionally of one split; their cloth isn't read.
+
+    They come from the index that a build writes; without one each action is looked at.
+    """
+    lines = read_index(root)
+    if lines is None:
+        return [read_entry(f) for f in list_sequences(root, split)]
+    return [
+        Entry(
+            str(line["name"]),
+            int(line["frames"]),
+            float(line["fps"]),
+            str(line["content"]),
+            join(root, str(line["folder"])),
+        )
+        for line in lines
+        if split is None or line["split"] == split
+    ]
+
+
+def index_dataset(root: Where) -> None:
+    """Writes the index of a dataset."""
+    splits = {f: s for s in SPLITS for f in list_sequences(root, s)}
+    lines = []
+    for folder in list_sequences(root):
+        e = read_entry(folder)
+        line = {"folder": last_name(folder), "name": e.name, "split": splits.get(folder, "")}
+        lines.append(line | {"frames": e.frames, "fps": e.fps, "content": e.content})
+    write_index(root, lines)
 
 
 class FrameStream:

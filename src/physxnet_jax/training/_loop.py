@@ -49,7 +49,7 @@ _Report = Callable[[int, int, dict[str, float]], None]
 
 def train(
     config: TrainConfig,
-    sequences: Items[Sequence | Where],
+    sequences: Items[Sequence | Where | Entry],
     folder: str | pathlib.Path,
     *,
     network: nnx.Module | None = None,
@@ -63,8 +63,8 @@ def train(
 
     Args:
         config: Settings of the run.
-        sequences: Simulated actions, including those of ``config.validation``: their folders from
-            `list_sequences`, which are read while others are learned from, or the actions.
+        sequences: Simulated actions, including those of ``config.validation``: their entries from
+            `list_entries` or folders, which are read while others are learned from, or the actions.
         folder: Folder for checkpoints and ``metrics.jsonl``.
         network: Any module with the signature of `Generator`; a `Generator` by default.
         loss: Any function of `LossInputs`; `configured_loss` by default.
@@ -121,7 +121,7 @@ class _Data:
     normalisation: Normalisation
 
 
-def _load_data(config: TrainConfig, sequences: Items[Sequence | Where]) -> _Data:
+def _load_data(config: TrainConfig, sequences: Items[Sequence | Where | Entry]) -> _Data:
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
     garments = {t: template(t) for t in config.model.templates}  # pyright: ignore[reportArgumentType]

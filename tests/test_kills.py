@@ -1,0 +1,146 @@
+"""What is killed at any moment and started again ends with the bytes of an undisturbed run."""
+
+import csv
+import dataclasses
+import os
+import pathlib
+import random
+import runpy
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from physxnet_jax.data import dataset_digest
+from physxnet_jax.motion import load_motion, save_motion
+
+_DEVICES = runpy.run_path(str(pathlib.Path(__file__).with_name("test_devices.py")))
+finish, free_port, start, weights = (
+    _DEVICES[name] for name in ("finish", "free_port", "start", "weights")
+)
+
+SETS = """[a]
+splits = ["train"]
+templates = ["bottom"]
+solver = { substeps = 8, contact_updates = 1 }
+"""
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """Motions, a configuration and the digest of the undisturbed dataset."""
+    folder = tmp_path_factory.mktemp("kills")
+    clip = load_motion("punch", fps=30.0)
+    clip = dataclasses.replace(clip, rotations=clip.rotations[:60], root=clip.root[:60])
+    save_motion(folder / "punch.npz", clip)
+    with (folder / "ACTIONS.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["split", "action", "file", "start_s", "frames_at_30fps"])
+        table.writerows(["train", f"part {k}", "punch.npz", 0.2 * k, 5 + k] for k in range(6))
+    (folder / "sets.toml").write_text(SETS)
+    done = build(folder, "plain")
+    assert done.wait(200) == 0
+    return folder, dataset_digest(folder / "plain")
+
+
+def build(folder, out, *more):
+    words = ["dataset", "build", f"{folder}/sets.toml#a", "--out", f"{folder}/{out}"]
+    run = "import sys; from physxnet_jax.cli import main; sys.exit(main())"
+    command = [sys.executable, "-c", run, *words, "--mocap", str(folder), *more]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def stored(folder, out):
+    return len(list((folder / out).glob("*/bottom/zarr.json")))
+
+
+@pytest.mark.release
+def test_a_killed_build_goes_on_to_the_same_bytes(place):
+    folder, digest = place
+    process = build(folder, "one")
+    while not stored(folder, "one"):
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    assert stored(folder, "one") < 6, "it was killed in the middle"
+    assert build(folder, "one").wait(200) == 0
+    assert dataset_digest(folder / "one") == digest
+
+
+def workers_of():
+    """Processes that run jobs."""
+    found = []
+    for path in pathlib.Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if b"ray::_attempt" in path.read_bytes():
+                found.append(int(path.parent.name))
+        except OSError:
+            continue
+    return found
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(sys.platform != "linux", reason="finds workers in /proc")
+def test_a_build_on_ray_killed_five_times_has_the_same_bytes(place):
+    pytest.importorskip("ray", reason="Ray isn't installed: pip install 'physxnet-jax[cluster]'")
+    folder, digest = place
+    chance = random.Random(1)
+    killed = []
+    process = build(folder, "ray", "--ray")
+    while len(killed) < 5:
+        time.sleep(chance.uniform(3.0, 12.0))
+        if process.poll() is not None:
+            # It was done: all of it again.
+            for path in (folder / "ray").glob("*/bottom/zarr.json"):
+                path.unlink()
+            process = build(folder, "ray", "--ray")
+            continue
+        workers = workers_of()
+        victim = chance.choice([process.pid, *workers])
+        killed.append("driver" if victim == process.pid else "worker")
+        os.kill(victim, signal.SIGKILL)
+        if victim == process.pid:
+            process.wait()
+            process = build(folder, "ray", "--ray")
+    process.wait(300)
+    assert build(folder, "ray", "--ray").wait(300) == 0
+    assert dataset_digest(folder / "ray") == digest
+    assert len(set(killed)) == 2, killed
+
+
+@pytest.mark.nightly
+def test_training_killed_five_times_has_the_same_weights(tmp_path):
+    finish(start(tmp_path / "plain", steps=400, epochs=80))
+    chance = random.Random(2)
+    for _ in range(5):
+        process = start(tmp_path / "killed", steps=400, epochs=80)
+        time.sleep(chance.uniform(8.0, 20.0))
+        process.kill()
+        process.communicate()
+    finish(start(tmp_path / "killed", steps=400, epochs=80))
+    np.testing.assert_array_equal(weights(tmp_path / "killed"), weights(tmp_path / "plain"))
+
+
+@pytest.mark.release
+def test_a_lost_training_process_ends_the_run_which_resumes(tmp_path):
+    def both(steps):
+        port = free_port()
+        return [start(tmp_path / "killed", number=str(k), port=port, steps=steps) for k in range(2)]
+
+    first, second = both(40)
+    checkpoints = tmp_path / "killed/checkpoints"
+    # Names of unfinished ones are no numbers.
+    while not (checkpoints.is_dir() and any(p.name.isdigit() for p in checkpoints.iterdir())):
+        assert first.poll() is None, first.communicate()[0][-2000:]
+        time.sleep(0.02)
+    second.kill()
+    second.communicate()
+    out, _ = first.communicate(timeout=150)
+    assert first.returncode != 0 and "another process of this run has ended" in out
+    assert not (tmp_path / "killed/weights.npz").exists()
+    finish(*both(20), start(tmp_path / "plain"))
+    assert np.abs(weights(tmp_path / "killed") - weights(tmp_path / "plain")).max() < 1e-5
