@@ -267,13 +267,13 @@ def test_pins_follow_the_skin_in_proportion_to_time():
 def test_time_continues_across_blocks_of_frames(monkeypatch):
     """Wind and gusts are told the clip's time: zero is its first frame, not a block's."""
     seen = []
-    real = _rollout.advance
+    real = _rollout.advance_on
 
     def spy(*words, **more):
         seen.append(float(more["time"]))
         return real(*words, **more)
 
-    monkeypatch.setattr(_rollout, "advance", spy)
+    monkeypatch.setattr(_rollout, "advance_on", spy)
     scene = prepare_scene(Scene((square_sheet(3),), (Gravity(),)))
     simulate_batch(scene, [load_motion("balance", fps=10.0)], solver=XPBD(2, 1))
     # A second and a half leads in, of which the last frame is the clip's first.

@@ -143,7 +143,7 @@ KINDS: dict[str, Kind] = {
         style="strapless",
         summary="strapless top held by elastic",
         ranges={
-            "ease": _range(0.04, 0.035, 0.14),
+            "ease": _range(0.04, 0.035, 0.10),
             "length": _range(0.34, 0.24, 0.43),
             "flare": _range(0.06, 0.0, 0.40),
         },
