@@ -349,7 +349,7 @@ def measure_store(work: pathlib.Path) -> list[dict]:
 
 
 def _same(r: dict[str, Any]) -> str:
-    gap = f", within {r['largest_difference']:.0e}" if r.get("largest_difference") else ""
+    gap = f", {r['largest_difference']:.0e} apart" if r.get("largest_difference") else ""
     return ("yes" if r["same_result"] else "no") + gap
 
 

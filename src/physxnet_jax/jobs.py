@@ -131,6 +131,7 @@ def _on_ray(jobs: Sequence[Job], address: str, report: Report | None) -> Iterato
 
 
 def _join(ray: Any, address: str) -> None:
+    # What later versions of Ray do anyway; this one warns that it doesn't yet.
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
         with warnings.catch_warnings():

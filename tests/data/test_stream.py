@@ -39,7 +39,7 @@ def stream(lengths, *, capacity, batch=8, seed=3, mirrored=False, reads=None):
     for k, n in enumerate(lengths):
         motion = load_motion("walk")
         s = _Numbers(f"a{k}", "train", motion, {}, {}, np.arange(begin, begin + n))
-        entries.append(Entry(s.name, n, 30.0, "", s))
+        entries.append(Entry(s.name, "train", n, 30.0, "", s))
         begin += n
     if mirrored:
         entries += [dataclasses.replace(e, mirrored=True) for e in entries]
@@ -191,9 +191,10 @@ def test_index_lists_what_the_actions_say(tmp_path):
     assert list_entries(tmp_path) == looked and [e.name for e in looked] == ["other", "walk"]
     assert [e.name for e in list_entries(tmp_path, "train")] == ["walk"]
     assert dataset_digest(tmp_path) == before
-    (tmp_path / "index.json").write_text("[3]")
-    with pytest.raises(FormatError, match="damaged"):
-        list_entries(tmp_path)
+    for text in ("[3]", '[{"folder": "walk"}]'):
+        (tmp_path / "index.json").write_text(text)
+        with pytest.raises(FormatError, match="damaged"):
+            list_entries(tmp_path)
     remove_index(tmp_path)
     remove_index(tmp_path)
     assert list_entries(tmp_path) == looked

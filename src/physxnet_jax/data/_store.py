@@ -38,7 +38,7 @@ _NOTE, _ACTION, _ARRAY, _MOTION = "dataset.json", "action.json", "zarr.json", "m
 # Timings differ between runs: they aren't part of the dataset's digest.
 _TIMES, _OLD_LOG = "times", "build_log.jsonl"
 # Derived from the rest, so that it isn't part of the digest either.
-_INDEX = "index.json"
+_INDEX, _INDEXED = "index.json", ("folder", "name", "split", "frames", "fps", "content")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -354,19 +354,19 @@ def read_sequence(folder: Where) -> Sequence:
     Raises:
         FormatError: The folder doesn't hold an action.
     """
-    name, motion, meta = read_meta_of_all(folder)
+    split, motion, meta = read_description(folder)
     offsets = {t: read_offsets(folder, t) for t in meta}
-    return Sequence(name, _action_note(folder)["split"], motion, offsets, meta)
+    return Sequence(motion.name, split, motion, offsets, meta)
 
 
-def read_meta_of_all(folder: Where) -> tuple[str, Motion, dict[str, dict[str, Any]]]:
-    """Name, motion and each garment's metadata of an action; its cloth isn't read."""
+def read_description(folder: Where) -> tuple[str, Motion, dict[str, dict[str, Any]]]:
+    """Split, motion and each garment's metadata of an action; its cloth isn't read."""
     info = _action_note(folder)
     # The description of an array is written last: what lacks it is in progress or interrupted.
     parts = [name.split("/") for name in list_files(folder)]
     found = [p[0] for p in parts if p[1:] == [_ARRAY]]
-    name = info["name"]
-    return name, _read_motion(folder, name), {t: read_meta(folder, t) for t in found}
+    motion = _read_motion(folder, info["name"])
+    return info["split"], motion, {t: read_meta(folder, t) for t in found}
 
 
 def list_sequences(root: Where, split: str | None = None) -> list[str]:
@@ -396,7 +396,7 @@ def read_index(root: Where) -> list[dict[str, Any]] | None:
     if found is None:
         return None
     with _report_damage(join(root, _INDEX)):
-        return [_as_dict(line) for line in json.loads(found)]
+        return [{k: _as_dict(line)[k] for k in _INDEXED} for line in json.loads(found)]
 
 
 def remove_index(root: Where) -> None:

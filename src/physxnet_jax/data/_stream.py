@@ -12,15 +12,14 @@ import numpy as np
 from jaxtyping import Int
 
 from ..errors import FormatError
-from ._config import SPLITS
 from ._files import join, last_name
 from ._frames import Frames, content_hash, take
 from ._store import (
     Sequence,
     Where,
     list_sequences,
+    read_description,
     read_index,
-    read_meta_of_all,
     read_sequence,
     write_index,
 )
@@ -36,6 +35,7 @@ class Entry:
 
     Attributes:
         name: Name of the action.
+        split: ``train``, ``test`` or ``extra``.
         frames: Number of frames.
         fps: Frames per second.
         content: A short hash of its cloth.
@@ -44,6 +44,7 @@ class Entry:
     """
 
     name: str
+    split: str
     frames: int
     fps: float
     content: str
@@ -61,9 +62,10 @@ def read_entry(source: Where | Sequence | Entry) -> Entry:
         return source
     if isinstance(source, Sequence):
         motion, content = source.motion, content_hash(source.meta, source.offsets)
-        return Entry(source.name, motion.num_frames, motion.fps, content, source)
-    name, motion, meta = read_meta_of_all(source)
-    return Entry(name, motion.num_frames, motion.fps, content_hash(meta, None), source)
+        return Entry(source.name, source.split, motion.num_frames, motion.fps, content, source)
+    split, motion, meta = read_description(source)
+    content = content_hash(meta, None)
+    return Entry(motion.name, split, motion.num_frames, motion.fps, content, source)
 
 
 def list_entries(root: Where, split: str | None = None) -> list[Entry]:
@@ -77,6 +79,7 @@ def list_entries(root: Where, split: str | None = None) -> list[Entry]:
     return [
         Entry(
             str(line["name"]),
+            str(line["split"]),
             int(line["frames"]),
             float(line["fps"]),
             str(line["content"]),
@@ -89,11 +92,10 @@ def list_entries(root: Where, split: str | None = None) -> list[Entry]:
 
 def index_dataset(root: Where) -> None:
     """Writes the index of a dataset."""
-    splits = {f: s for s in SPLITS for f in list_sequences(root, s)}
     lines = []
     for folder in list_sequences(root):
         e = read_entry(folder)
-        line = {"folder": last_name(folder), "name": e.name, "split": splits.get(folder, "")}
+        line = {"folder": last_name(folder), "name": e.name, "split": e.split}
         lines.append(line | {"frames": e.frames, "fps": e.fps, "content": e.content})
     write_index(root, lines)
 

@@ -161,7 +161,7 @@ def simulate_batch(
         raise SimulationError("No motion to simulate; pass at least one.")
     clear_caches_if_full()
     used = min(len(jax.local_devices()), len(motions)) if devices is None else devices
-    missing = -len(motions) % used
+    missing = -len(motions) % max(used, 1)
     mesh = make_mesh(len(motions) + missing, used, local=True)
     padded = [*motions, *missing * motions[-1:]]
     solver = PRESETS["standard"].at_rate(motions[0].fps) if solver is None else solver
