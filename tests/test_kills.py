@@ -140,7 +140,7 @@ def test_a_lost_training_process_ends_the_run_which_resumes(tmp_path):
     second.kill()
     second.communicate()
     out, _ = first.communicate(timeout=150)
-    assert first.returncode != 0 and "another process of this run has ended" in out
+    assert first.returncode != 0 and "another process of this run has ended" in out, out[-6000:]
     assert not (tmp_path / "killed/weights.npz").exists()
     finish(*both(20), start(tmp_path / "plain"))
     assert np.abs(weights(tmp_path / "killed") - weights(tmp_path / "plain")).max() < 1e-5

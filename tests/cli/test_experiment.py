@@ -1,5 +1,6 @@
 """From a configuration to a table of errors, through the command line, at toy size."""
 
+import importlib.util
 import json
 import shutil
 
@@ -26,6 +27,35 @@ epochs = 2
 batch = 4
 adversarial = false
 """
+
+
+def check_on_ray(measure, rows, folder):
+    """Jobs on Ray give the same rows in the same order, apart from their times."""
+    if importlib.util.find_spec("ray") is None:
+        return
+    out = folder / "on_ray.json"
+    for _ in range(2):
+        assert main([*measure[:-1], str(out), "--ray", "--quiet"]) == 0
+        same = json.loads(out.read_text())
+        for a, b in zip(same, rows, strict=True):
+            assert a.keys() == b.keys()
+            for key in a.keys() - {"ms_per_frame"}:
+                word = isinstance(b[key], str)
+                assert a[key] == (b[key] if word else pytest.approx(b[key], rel=1e-3)), key
+
+
+@pytest.mark.release
+def test_stress_on_ray(capsys):
+    pytest.importorskip("ray", reason="Ray isn't installed: physxnet-jax[cluster]")
+    shown = []
+    for extra in ([], ["--ray"]):
+        assert main(["stress", "--cases", "hanging_strip", "free_fall", "--json", *extra]) == 0
+        shown.append(json.loads(capsys.readouterr().out))
+    plain, on_ray = shown
+    assert [r["case"] for r in on_ray] == [r["case"] for r in plain]
+    for a, b in zip(on_ray, plain, strict=True):
+        assert a["quantity"] == b["quantity"] and a["holds"] == b["holds"]
+        assert a["measured"] == pytest.approx(b["measured"], rel=0.05, abs=1e-5)
 
 
 @pytest.mark.release
@@ -75,6 +105,7 @@ def test_build_train_evaluate(tmp_path, capsys):
     assert all(r["finite_share"] == 1.0 and 0 < r["rmse_vertices_mm"] < 200 for r in rows)
     assert (tmp_path / "errors_vertices.png").is_file()
     assert "better than lbs" in (tmp_path / "errors.md").read_text()
+    check_on_ray(measure, rows, tmp_path)
     before = (tmp_path / "errors.json").stat().st_mtime_ns
     assert main([*measure, "--quiet"]) == 0
     assert (tmp_path / "errors.json").stat().st_mtime_ns == before, "nothing is measured twice"

@@ -100,12 +100,40 @@ def index_dataset(root: Where) -> None:
     write_index(root, lines)
 
 
+@dataclasses.dataclass(frozen=True)
+class _Group:
+    """Actions that are in memory together, and the frames of each step that uses them.
+
+    Attributes:
+        actions: Numbers of the actions, in whose order their frames are counted.
+        starts: Number of each action's first frame, and of all frames.
+        edges: First frame of each row's part, and the end of it, shape [rows, 2].
+        order: Frames, shape [steps, rows].
+    """
+
+    actions: tuple[int, ...]
+    starts: Int[np.ndarray, " bounds"]
+    edges: Int[np.ndarray, "rows 2"]
+    order: Int[np.ndarray, "steps rows"]
+
+    def part(self, rows: slice) -> tuple[tuple[int, ...], int]:
+        """The actions that some rows of all batches come from, and the first of their frames."""
+        begin, end = self.edges[rows][0, 0], self.edges[rows][-1, 1]
+        first = int(np.searchsorted(self.starts, begin, side="right")) - 1
+        last = int(np.searchsorted(self.starts, end, side="left"))
+        return self.actions[first:last], int(self.starts[first])
+
+
 class FrameStream:
     """The training frames of actions, of which a limited number is in memory.
 
-    If all fit, an epoch is a permutation of them. Otherwise it is a permutation of the actions in
-    groups, with the frames of each group permuted: while one is learned from, the next is read.
-    The order depends on seed and step alone, so that a run can resume anywhere.
+    If all fit, they are one group. Otherwise the actions of each epoch are put into groups at
+    random: while one is learned from, the next is read. A group's frames are divided into as many
+    parts as a batch has rows; each row goes through its own part in random order. So a process that
+    needs some of the rows reads some of the actions, and the order depends on seed and step alone:
+    a run can resume anywhere, on any number of processes.
+
+    What is left over of each group, less than a batch, differs from epoch to epoch.
 
     Args:
         entries: Actions.
@@ -139,7 +167,7 @@ class FrameStream:
         self._entries, self._load, self._mirror = list(entries), load, mirror
         self._batch, self._seed, self._capacity = batch, seed, capacity
         self._count = sum(e.frames for e in entries)
-        self._whole: Frames | None = None
+        self._kept: tuple[tuple[int, ...], Frames] | None = None
 
     def __len__(self) -> int:
         return self._count
@@ -151,98 +179,81 @@ class FrameStream:
 
     def first(self) -> Frames:
         """The first group of frames, for what needs a sample."""
-        groups, _ = self._epoch(0)
-        return self._read(groups[0])
+        return self._read(self._epoch(0)[0].actions)
 
     def batches(self, start: int, rows: slice) -> "Batches":
         """Batches from a step on; of each the rows that this process needs."""
         return Batches(self._produce(start, rows))
 
-    def _epoch(self, epoch: int) -> tuple[list[list[int]], Int[np.ndarray, " frames"]]:
-        """Actions of each group, and the order of frames, numbered from group to group."""
+    def _epoch(self, epoch: int) -> list[_Group]:
         rng = np.random.default_rng([self._seed, epoch])
         if self._count <= self._capacity:
-            return [list(range(len(self._entries)))], rng.permutation(self._count)
-        groups: list[list[int]] = [[]]
+            return [self._group(range(len(self._entries)), self.steps_per_epoch, rng)]
+        chosen: list[list[int]] = [[]]
         size = 0
         for k in rng.permutation(len(self._entries)):
             frames = self._entries[k].frames
-            if groups[-1] and size + frames > self._capacity // 2:
-                groups.append([])
+            if chosen[-1] and size + frames > self._capacity // 2:
+                chosen.append([])
                 size = 0
-            groups[-1].append(int(k))
+            chosen[-1].append(int(k))
             size += frames
-        order, begin = [], 0
-        for group in groups:
-            frames = self._frames_of(group)
-            order.append(begin + rng.permutation(frames))
-            begin += frames
-        return groups, np.concatenate(order)
+        steps = [sum(self._entries[k].frames for k in c) // self._batch for c in chosen]
+        # All epochs have the same number of steps.
+        steps[-1] += self.steps_per_epoch - sum(steps)
+        return [self._group(c, n, rng) for c, n in zip(chosen, steps, strict=True) if n]
 
-    def _frames_of(self, group: list[int]) -> int:
-        return sum(self._entries[k].frames for k in group)
+    def _group(self, actions: Items[int], steps: int, rng: np.random.Generator) -> _Group:
+        starts = np.cumsum([0, *(self._entries[k].frames for k in actions)])
+        rows = np.arange(self._batch)
+        begin = rows * starts[-1] // self._batch
+        end = np.maximum((rows + 1) * starts[-1] // self._batch, begin + 1)
+        order = [
+            np.resize(a + rng.permutation(b - a), steps) for a, b in zip(begin, end, strict=True)
+        ]
+        return _Group(tuple(actions), starts, np.stack([begin, end], 1), np.stack(order, 1))
 
-    def _read(self, group: list[int]) -> Frames:
-        if self._whole is not None:
-            return self._whole
-        frames = self._load(self._sequences(group))
+    def _read(self, actions: tuple[int, ...]) -> Frames:
+        if self._kept is not None and self._kept[0] == actions:
+            return self._kept[1]
+        # First, since what was kept isn't needed any more.
+        self._kept = None
+        frames = self._load(self._sequences(actions))
         if self._count <= self._capacity:
-            self._whole = frames
+            self._kept = actions, frames
         return frames
 
-    def _sequences(self, group: list[int]) -> Iterator[Sequence]:
+    def _sequences(self, actions: tuple[int, ...]) -> Iterator[Sequence]:
         # One at a time, since each is as large as its part of the frames.
-        for k in group:
+        for k in actions:
             entry = self._entries[k]
             s = entry.read()
             yield self._mirror(s) if entry.mirrored else s
 
     def _produce(self, start: int, rows: slice) -> Iterator[dict[str, np.ndarray]]:
-        per_epoch = self.steps_per_epoch
-        epoch, at = divmod(start, per_epoch)
+        epoch, at = divmod(start, self.steps_per_epoch)
         loaded: dict[tuple[int, ...], concurrent.futures.Future[Frames]] = {}
         with concurrent.futures.ThreadPoolExecutor(1) as reader:
-
-            def need(wanted: list[list[int]]) -> None:
-                """Starts to read groups, and forgets all others."""
-                keys = [tuple(g) for g in wanted]
-                for key in set(loaded) - set(keys):
-                    del loaded[key]
-                for key in keys:
-                    if key not in loaded:
-                        loaded[key] = reader.submit(self._read, list(key))
-
+            groups = self._epoch(epoch)
             while True:
-                groups, order = self._epoch(epoch)
-                ends = np.cumsum([self._frames_of(g) for g in groups])
-                after = self._epoch(epoch + 1)[0][0]
-                for step in range(at, per_epoch):
-                    index = order[step * self._batch : (step + 1) * self._batch]
-                    index = np.resize(index, self._batch)
-                    used = np.searchsorted(ends, index, side="right")
-                    last = int(used.max())
-                    behind = groups[last + 1] if last + 1 < len(groups) else after
-                    need([*groups[int(used.min()) : last + 1], behind])
-                    yield self._gather(groups, ends, index[rows], loaded)
-                epoch, at = epoch + 1, 0
-
-    def _gather(
-        self,
-        groups: list[list[int]],
-        ends: np.ndarray,
-        index: np.ndarray,
-        loaded: dict[tuple[int, ...], "concurrent.futures.Future[Frames]"],
-    ) -> dict[str, np.ndarray]:
-        used = np.searchsorted(ends, index, side="right")
-        parts = []
-        for g in np.unique(used):
-            begin = ends[g] - self._frames_of(groups[g])
-            frames = loaded[tuple(groups[g])].result()
-            parts.append(take(frames, index[used == g] - begin))
-        if len(parts) == 1:
-            return parts[0]
-        # Groups follow each other within a batch, so parts are in the order of the index.
-        return {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
+                following = self._epoch(epoch + 1)
+                for group, after in zip(groups, [*groups[1:], following[0]], strict=True):
+                    if at >= len(group.order):
+                        at -= len(group.order)
+                        continue
+                    actions, first = group.part(rows)
+                    needed = (actions, after.part(rows)[0])
+                    for key in set(loaded) - set(needed):
+                        del loaded[key]
+                    for key in needed:
+                        if key not in loaded:
+                            loaded[key] = reader.submit(self._read, key)
+                    frames = loaded[actions].result()
+                    for index in group.order[at:, rows]:
+                        yield take(frames, index - first)
+                    at = 0
+                    del frames
+                epoch, groups = epoch + 1, following
 
 
 class Batches:

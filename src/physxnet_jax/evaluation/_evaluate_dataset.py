@@ -75,11 +75,18 @@ def evaluate_dataset(
         jobs = [
             Job(s.name, _measure, (*asked, folder, [r for r in rows if r.action == s.name]))
             for folder, s in zip(folders, sequences, strict=True)
+            if not all(_is_measured(x, [s], templates, rows) for x in labels.values())
         ]
+        if not jobs:
+            return rows
+        old = list(rows)
         for _, new in run_jobs(jobs, ray=ray, report=report):
             rows += [dataclasses.replace(row, weights=digests[row.method]) for row in new]
             save_rows(out, rows)
-        return rows
+        order = (tuple(templates), tuple(labels.values()), tuple(s.name for s in sequences))
+        new = sorted(rows[len(old) :], key=functools.partial(_place, order))
+        save_rows(out, [*old, *new])
+        return [*old, *new]
     # A method whose rows are complete isn't loaded.
     methods = {
         label: _method(name, training_root, templates, report)
@@ -110,6 +117,11 @@ def _measure(
     """The rows of an action that aren't done, in a process that may keep methods for the next."""
     methods = {_label(n): _kept_method(n, training_root, templates) for n in names}
     return list(evaluate(methods, [read_sequence(folder)], templates=templates, done=done))
+
+
+def _place(order: tuple[tuple[str, ...], ...], row: ActionError) -> tuple[int, ...]:
+    found = (row.template, row.method, row.action)
+    return tuple(names.index(x) for names, x in zip(order, found, strict=True))
 
 
 @functools.cache
