@@ -214,7 +214,11 @@ def bind_to_predictor(
     base = body.rest_vertices(body.default_shape())
     valid = predictor.texel_points.valid[garment.template]
     return bind_garment(
-        body, rest, garment, bind(garment, atlas=predictor.atlas, body=body, rest=base, valid=valid)
+        body,
+        rest,
+        garment,
+        bind(garment, atlas=predictor.atlas, body=body, rest=base, valid=valid),
+        smooth=not predictor.config.skirt_chart,
     )
 
 
@@ -253,7 +257,7 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
         skirts = any(w.template == "dress" for w in worn)
         if skirts and predictor.config.family == "paper":
             raise ValueError("dresses of the paper family: use make_dresser(..., shape=shape).")
-        points = dataclasses.replace(predictor.texel_points, rest=predictor.atlas.to_body @ rest)
+        points = dataclasses.replace(predictor.texel_points, rest=predictor.atlas.at_texels(rest))
         predictor = dataclasses.replace(predictor, texel_points=points)
         worn = tuple(
             dataclasses.replace(w, anchor=w.binding.to_body @ rest)

@@ -31,23 +31,30 @@ class BoundGarment(SkinnedGarment):
         binding: Texels that the vertices sample, and the body points they belong to.
         anchor: Those body points at rest [m], shape [vertices, 3].
         anchor_weights: Their skinning weights, shape [vertices, joints].
-        smoothing: Averages sampled offsets over neighbouring vertices.
+        smoothing: Averages sampled offsets over neighbouring vertices; None to sample maps as they
+            are.
     """
 
     binding: Binding
     anchor: Float[Array, "vertices 3"]
     anchor_weights: Float[Array, "vertices joints"]
-    smoothing: Smoothing
+    smoothing: Smoothing | None
 
     def sample(
         self, values: Float[Array, "*batch texels channels"]
     ) -> Float[Array, "*batch vertices channels"]:
-        """Texel values sampled at the garment's vertices and smoothed."""
-        return self.smoothing @ self.binding.sample(values)
+        """Texel values sampled at the garment's vertices."""
+        sampled = self.binding.sample(values)
+        return sampled if self.smoothing is None else self.smoothing @ sampled
 
 
 def bind_garment(
-    body: Body, rest: Float[Array, "all 3"], garment: Garment, binding: Binding
+    body: Body,
+    rest: Float[Array, "all 3"],
+    garment: Garment,
+    binding: Binding,
+    *,
+    smooth: bool = True,
 ) -> BoundGarment:
     """Prepares a garment to be dressed on a body shape.
 
@@ -56,6 +63,7 @@ def bind_garment(
         rest: `Body.rest_vertices` of that shape [m].
         garment: The garment.
         binding: Binding of its vertices to an atlas, see `bind`.
+        smooth: Average sampled offsets over the cloth, for maps that are too coarse for folds.
 
     Returns:
         The bound garment, as `dress_frames` takes it.
@@ -65,7 +73,9 @@ def bind_garment(
         base = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
         radius = _SMOOTHING_SKIRT
     mesh = garment.mesh
-    smoothing = gaussian_smoothing(np.asarray(mesh.vertices), np.asarray(mesh.faces), radius)
+    smoothing = None
+    if smooth:
+        smoothing = gaussian_smoothing(np.asarray(mesh.vertices), np.asarray(mesh.faces), radius)
     return BoundGarment(
         garment.rest_vertices(rest),
         garment.skin,

@@ -31,12 +31,19 @@ class ModelConfig:
         resolution: Texels per side, a multiple of 16.
         width: Channels of the first layer.
         templates: Templates with a decoder.
+        skirt_chart: Whether the maps have a chart for skirts, see `make_atlas`. Maps that have one
+            are sampled as they are; others are smoothed over the cloth.
     """
 
     inputs: FeatureConfig = dataclasses.field(default_factory=FeatureConfig)
     resolution: int = 128
     width: int = 32
     templates: tuple[str, ...] = ("top", "bottom", "dress")
+    skirt_chart: bool = False
+
+    def __post_init__(self) -> None:
+        if self.skirt_chart and self.family == "paper":
+            raise ValueError("skirt_chart is for the family local; the paper's maps have none.")
 
     @property
     def family(self) -> Family:
@@ -94,7 +101,7 @@ def make_texel_points(
     """
     joined = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
     return TexelPoints(
-        atlas.to_body @ rest, atlas.to_body @ joined, atlas.to_body @ body.weights, valid
+        atlas.at_texels(rest), atlas.at_texels(joined), atlas.at_texels(body.weights), valid
     )
 
 

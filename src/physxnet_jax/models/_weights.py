@@ -253,7 +253,7 @@ def _filled(
     state: Any,
 ) -> Predictor:
     """Fills a network's structure with the tensors of its file."""
-    atlas = make_atlas(model.resolution)
+    atlas = make_atlas(model.resolution, skirt=model.skirt_chart)
     if atlas.digest() != card["atlas"]:
         raise WeightsError(
             f"{weights}: trained on atlas {card['atlas']}, this version makes"

@@ -216,6 +216,16 @@ class _Run:
         batches = self._data.frames.batches(self._done, own_rows(config.batch))
         try:
             self._steps(stop, batches, key, log)
+        except (jax.errors.JaxRuntimeError, ValueError) as error:
+            # A checkpoint raises the second for what a step raises the first for.
+            lost = isinstance(error, jax.errors.JaxRuntimeError) or "Gloo" in str(error)
+            if jax.process_count() == 1 or not lost:
+                raise
+            self._alone = True
+            raise PhysXNetError(
+                f"step {self._done}: another process of this run has ended. Start all of them"
+                " again: training resumes from the last checkpoint."
+            ) from error
         finally:
             batches.close()
 
@@ -231,18 +241,9 @@ class _Run:
         while self._done < stop and not self._stopping.exhausted:
             step_key = jax.random.fold_in(key, self._done)
             batch = split(self._mesh, next(batches))
-            try:
-                self._state, metrics = train_step(self._problem, self._state, batch, step_key)
-                self._done += 1
-                self._check_finite()
-            except jax.errors.JaxRuntimeError as error:
-                if jax.process_count() == 1:
-                    raise
-                self._alone = True
-                raise PhysXNetError(
-                    f"step {self._done}: another process of this run has ended. Start all of them"
-                    " again: training resumes from the last checkpoint."
-                ) from error
+            self._state, metrics = train_step(self._problem, self._state, batch, step_key)
+            self._done += 1
+            self._check_finite()
             if self._done % 20 == 0 or self._done == stop:
                 values = {k: float(v) for k, v in metrics.items()}
                 now = time.perf_counter()

@@ -47,7 +47,7 @@ def prepare_targets(model: ModelConfig) -> tuple[Atlas, TexelPoints, dict[str, C
     """Atlas, texel points and target tables of a model's templates on the default body."""
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
-    atlas = make_atlas(model.resolution)
+    atlas = make_atlas(model.resolution, skirt=model.skirt_chart)
     garments = {t: template(t) for t in model.templates}  # pyright: ignore[reportArgumentType]
     rows = {t: garment_map_rows(atlas, body, rest, g) for t, g in garments.items()}
     texel_points = make_texel_points(atlas, body, rest, {t: r.valid for t, r in rows.items()})
@@ -55,7 +55,11 @@ def prepare_targets(model: ModelConfig) -> tuple[Atlas, TexelPoints, dict[str, C
         t: ClothTables(
             to_cloth=rows[t],
             bound=bind_garment(
-                body, rest, g, bind(g, atlas=atlas, body=body, rest=rest, valid=rows[t].valid)
+                body,
+                rest,
+                g,
+                bind(g, atlas=atlas, body=body, rest=rest, valid=rows[t].valid),
+                smooth=not model.skirt_chart,
             ),
             edges=jnp.asarray(mesh_edges(np.asarray(g.mesh.faces)).vertices),
         )

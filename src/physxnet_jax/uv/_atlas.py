@@ -13,6 +13,7 @@ from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..geometry import connected_components
 from ..typing import pytree
 from ._rasterise import rasterise
+from ._skirt import SkirtChart, make_skirt_chart
 from ._transference import Transference
 
 _EXCLUDED_JOINTS = (
@@ -33,13 +34,15 @@ class Atlas:
 
     Attributes:
         texels: Covered texels in row-major order as flat indices, shape [texels].
-        to_body: T_UB, body vertices to texels, rows as ``texels``.
+        to_body: T_UB, body vertices to the texels of the body's chart, rows as the first of
+            ``texels``.
         uv: Texture coordinates in the atlas, shape [uvs, 2].
         faces: Body faces in the chart, vertex indices, shape [faces, 3].
         uv_faces: Their corners in ``uv``, shape [faces, 3].
-        height: Rows of a map.
+        height: Rows of a map, including those of the skirt's chart.
         width: Columns of a map.
         used_before: Share of texels that the clothed part covers in the original chart.
+        skirt: The chart of skirts, in the lowest rows; None without one.
     """
 
     texels: Int[Array, " texels"]
@@ -50,6 +53,17 @@ class Atlas:
     height: int = dataclasses.field(metadata={"static": True})
     width: int = dataclasses.field(metadata={"static": True})
     used_before: float = dataclasses.field(metadata={"static": True})
+    skirt: SkirtChart | None = None
+
+    @property
+    def body_rows(self) -> int:
+        """Rows of the body's chart."""
+        return self.height - (0 if self.skirt is None else self.skirt.rows)
+
+    @property
+    def num_body_texels(self) -> int:
+        """Number of covered texels of the body's chart."""
+        return self.to_body.shape[0]
 
     @property
     def num_texels(self) -> int:
@@ -58,14 +72,21 @@ class Atlas:
 
     @property
     def used(self) -> float:
-        """Share of texels covered."""
-        return self.num_texels / (self.height * self.width)
+        """Share of the texels of the body's chart that are covered."""
+        return self.num_body_texels / (self.body_rows * self.width)
 
     @property
     def mask(self) -> Bool[Array, "height width"]:
         """Which texels are covered."""
         flat = jnp.zeros((self.height * self.width,), bool).at[self.texels].set(True)
         return flat.reshape(self.height, self.width)
+
+    def at_texels(
+        self, values: Float[Array, "*batch vertices channels"]
+    ) -> Float[Array, "*batch texels channels"]:
+        """Values of body vertices at all covered texels."""
+        own = self.to_body @ values
+        return own if self.skirt is None else jnp.concatenate([own, self.skirt @ values], axis=-2)
 
     def to_map(
         self, values: Float[Array, "*batch texels channels"]
@@ -90,10 +111,14 @@ class Atlas:
         h.update(np.asarray(self.to_body.vertices).tobytes())
         # Weights are rounded: compilers may differ in the last bits.
         h.update(np.round(np.asarray(self.to_body.weights), 3).astype(np.float32).tobytes())
+        if self.skirt is not None:
+            h.update(np.asarray(self.skirt.left.vertices).tobytes())
         return h.hexdigest()[:16]
 
 
-def make_atlas(resolution: int | tuple[int, int] = 256, body: Body | None = None) -> Atlas:
+def make_atlas(
+    resolution: int | tuple[int, int] = 256, body: Body | None = None, *, skirt: bool = False
+) -> Atlas:
     """Builds the atlas at a resolution.
 
     The chart of the torso and limbs is cropped to its bounding box. Its rows are then
@@ -102,27 +127,32 @@ def make_atlas(resolution: int | tuple[int, int] = 256, body: Body | None = None
     Args:
         resolution: Texels per side, or (height, width).
         body: The body; the built-in one by default.
+        skirt: Append a chart for skirts, half as high as the body's.
 
     Returns:
         The atlas. ``used_before`` and ``used`` give the coverage before and after stretching.
+
+    Note (differs from the paper):
+        The paper has no chart for skirts: there, a dress samples the charts of both legs, which
+        don't meet.
 
     References:
         PhysXNet, section 4.2: face, hands and feet are removed, limbs stretched.
     """
     size = (resolution, resolution) if isinstance(resolution, int) else resolution
-    if body is None:
-        return _cached_atlas(*size)
-    return _make_atlas(size, body)
+    if body is None or body is load_body():
+        return _cached_atlas(*size, skirt)
+    return _make_atlas(size, body, skirt)
 
 
 @functools.cache
-def _cached_atlas(height: int, width: int) -> Atlas:
+def _cached_atlas(height: int, width: int, skirt: bool) -> Atlas:
     # Cached arrays mustn't be tracers of an enclosing transformation.
     with jax.ensure_compile_time_eval():
-        return _make_atlas((height, width), load_body())
+        return _make_atlas((height, width), load_body(), skirt)
 
 
-def _make_atlas(size: tuple[int, int], body: Body) -> Atlas:
+def _make_atlas(size: tuple[int, int], body: Body, skirt: bool) -> Atlas:
     height, width = size
     mesh = body.rest_mesh()
     faces, uv_faces = np.asarray(mesh.faces), np.asarray(mesh.uv_faces)
@@ -145,15 +175,20 @@ def _make_atlas(size: tuple[int, int], body: Body) -> Atlas:
         jnp.ones((len(own),), bool),
         NUM_BODY_VERTICES,
     )
+    skirt_chart = make_skirt_chart(body, height // 2, width) if skirt else None
+    if skirt_chart is not None:
+        below = height * width + np.arange(skirt_chart.rows * width)
+        texels = np.concatenate([texels, below]).astype(np.int32)
     return Atlas(
         jnp.asarray(texels),
         transference,
         jnp.asarray(stretched.astype(np.float32)),
         jnp.asarray(faces.astype(np.int32)),
         jnp.asarray(uv_faces.astype(np.int32)),
-        height,
+        height + (0 if skirt_chart is None else skirt_chart.rows),
         width,
         before,
+        skirt_chart,
     )
 
 

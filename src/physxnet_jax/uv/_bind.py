@@ -13,6 +13,7 @@ from ..geometry import TriMesh, cast_rays, closest_points, padded_rows, vertex_n
 from ..typing import pytree
 from ._atlas import Atlas, make_atlas
 from ._dress_body import dress_body
+from ._skirt import Hull, arm_weights, skirt_hull, skirt_rows, skirt_samples
 from ._transference import Transference
 
 # Maximum distance between skin and cloth along a ray [m].
@@ -28,16 +29,17 @@ class Binding:
 
     Attributes:
         to_body: T_XB, body vertices to garment vertices.
-        texel: Texels (rows of the atlas) each vertex samples, shape [vertices, 4].
-        weight: Their weights, rows sum to 1, shape [vertices, 4].
+        texel: Texels (rows of the atlas) each vertex samples, shape [vertices, k]: four, and four
+            more of the skirt's chart for a dress.
+        weight: Their weights, rows sum to 1, shape [vertices, k].
         hit_rate: Share of vertices whose ray hit the nearest part of the body.
         fallbacks: Number of vertices bound by the closest point instead.
         off_chart: Number of vertices without covered texels, bound to the nearest one.
     """
 
     to_body: Transference
-    texel: Int[Array, "vertices 4"]
-    weight: Float[Array, "vertices 4"]
+    texel: Int[Array, "vertices k"]
+    weight: Float[Array, "vertices k"]
     # Leaves rather than static fields, so that other values need no new compilation.
     hit_rate: Float[Array, ""]
     fallbacks: Int[Array, ""]
@@ -48,7 +50,7 @@ class Binding:
     ) -> Float[Array, "*batch vertices channels"]:
         """Interpolates texel values at garment vertices, bilinearly within the chart."""
         out = jnp.zeros((), values.dtype)
-        for k in range(4):
+        for k in range(self.texel.shape[1]):
             w = self.weight[:, k]
             w = w.reshape((1,) * (values.ndim - 2) + (*w.shape, 1))
             out = out + values[..., self.texel[:, k], :] * w
@@ -96,7 +98,32 @@ def garment_map_rows(
         max_distance=_MAX_DISTANCE[garment.template] + start,
     )
     faces = garment.mesh.faces[hits.face]
-    return Transference(faces, hits.weights, hits.valid, garment.num_vertices)
+    own = Transference(faces, hits.weights, hits.valid, garment.num_vertices)
+    if atlas.skirt is None:
+        return own
+    if garment.template != "dress":
+        below = atlas.num_texels - atlas.num_body_texels
+        corners, zeros = jnp.zeros((below, 3), jnp.int32), jnp.zeros((below, 3), jnp.float32)
+        return _stacked(own, Transference(corners, zeros, jnp.zeros(below, bool), own.columns))
+    hull = skirt_hull(body, np.asarray(rest))
+    arms = arm_weights(body, np.asarray(atlas.to_body @ body.weights))
+    upper = hull.share(np.asarray(points)[:, 1], arms) < 1.0
+    own = dataclasses.replace(own, valid=own.valid & jnp.asarray(upper))
+    return _stacked(own, skirt_rows(atlas.skirt, hull, garment, _skirt_share(body, hull, garment)))
+
+
+def _stacked(a: Transference, b: Transference) -> Transference:
+    return Transference(
+        jnp.concatenate([a.vertices, b.vertices]),
+        jnp.concatenate([a.weights, b.weights]),
+        jnp.concatenate([a.valid, b.valid]),
+        a.columns,
+    )
+
+
+def _skirt_share(body: Body, hull: Hull, garment: Garment) -> Float[np.ndarray, " vertices"]:
+    heights = np.asarray(garment.mesh.vertices)[:, 1]
+    return hull.share(heights, arm_weights(body, np.asarray(garment.skin)))
 
 
 def bind(
@@ -113,6 +140,9 @@ def bind(
     hit. Without a hit, or with one on another limb, it takes the closest point. Sampling
     there is bilinear among texels that the template covers and that are neighbours on
     the body, so nothing bleeds over the chart's edge.
+
+    Where an atlas has a chart for skirts, the lower part of a dress samples that: its rays start at
+    the axis of the hull around both legs.
 
     Args:
         garment: Any garment on the body.
@@ -148,6 +178,16 @@ def bind(
     good, face, weights = good[:count], face[:count], weights[:count]
     uv = np.einsum("vk,vkc->vc", weights, np.asarray(mesh.uv)[np.asarray(mesh.uv_faces)[face]])
     texel, weight, off = sampling_weights(atlas, uv, np.asarray(valid), mesh, face, weights)
+    if atlas.skirt is not None and garment.template == "dress":
+        hull, own = skirt_hull(body, np.asarray(rest)), atlas.num_body_texels
+        share = _skirt_share(body, hull, garment).astype(np.float32)
+        below, low, missed = skirt_samples(
+            atlas.skirt, hull, np.asarray(garment.mesh.vertices), np.asarray(valid)[own:]
+        )
+        texel = np.concatenate([texel, own + below], axis=1)
+        weight = np.concatenate([(1.0 - share)[:, None] * weight, share[:, None] * low], axis=1)
+        good |= share == 1.0
+        off = np.where(share == 1.0, missed, off)
     return Binding(
         Transference(
             jnp.asarray(np.asarray(mesh.faces)[face]),
@@ -159,7 +199,7 @@ def bind(
         jnp.asarray(weight),
         jnp.asarray(np.float32(np.mean(good))),
         jnp.asarray(np.int32(np.sum(~good))),
-        jnp.asarray(np.int32(off)),
+        jnp.asarray(np.int32(off.sum())),
     )
 
 
@@ -170,7 +210,7 @@ def sampling_weights(
     mesh: TriMesh,
     face: Int[np.ndarray, " points"],
     weights: Float[np.ndarray, "points 3"],
-) -> tuple[Int[np.ndarray, "points 4"], Float[np.ndarray, "points 4"], int]:
+) -> tuple[Int[np.ndarray, "points 4"], Float[np.ndarray, "points 4"], Bool[np.ndarray, " points"]]:
     """Bilinear weights over valid texels that are neighbours on the body as well.
 
     Adjacent texels of the map may lie on different limbs. Texels more than a few texel
@@ -178,13 +218,14 @@ def sampling_weights(
     texels takes the texel nearest to it on the body.
 
     Returns:
-        Rows of the atlas, weights that sum to 1, and the number of points that took the
-        nearest texel.
+        Rows of the atlas, weights that sum to 1, and which points took the nearest texel.
     """
-    row_of = np.full(atlas.height * atlas.width, -1)
-    row_of[np.asarray(atlas.texels)] = np.arange(atlas.num_texels)
-    x = uv[:, 0] * atlas.width - 0.5
-    y = (1.0 - uv[:, 1]) * atlas.height - 0.5
+    height, width, count = atlas.body_rows, atlas.width, atlas.num_body_texels
+    row_of = np.full(height * width, -1)
+    row_of[np.asarray(atlas.texels)[:count]] = np.arange(count)
+    valid = valid[:count]
+    x = uv[:, 0] * width - 0.5
+    y = (1.0 - uv[:, 1]) * height - 0.5
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
     fx, fy = x - x0, y - y0
     texel_points = np.asarray(atlas.to_body @ mesh.vertices)
@@ -194,17 +235,12 @@ def sampling_weights(
     texel = np.zeros((len(uv), 4), dtype=np.int32)
     weight = np.zeros((len(uv), 4))
     # One texel covers about 1.5 m / size of skin; seams are much farther apart.
-    limit = 6.0 / min(atlas.height, atlas.width)
+    limit = 6.0 / min(height, width)
     for k, (dx, dy) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
         cx, cy = x0 + dx, y0 + dy
-        inside = (cx >= 0) & (cx < atlas.width) & (cy >= 0) & (cy < atlas.height)
-        row = np.where(
-            inside,
-            row_of[
-                np.clip(cy, 0, atlas.height - 1) * atlas.width + np.clip(cx, 0, atlas.width - 1)
-            ],
-            -1,
-        )
+        inside = (cx >= 0) & (cx < width) & (cy >= 0) & (cy < height)
+        flat = np.clip(cy, 0, height - 1) * width + np.clip(cx, 0, width - 1)
+        row = np.where(inside, row_of[flat], -1)
         ok = (row >= 0) & valid[row]
         ok &= np.linalg.norm(texel_points[row] - query_points, axis=1) < limit
         w = np.where(dx, fx, 1 - fx) * np.where(dy, fy, 1 - fy)
@@ -219,7 +255,7 @@ def sampling_weights(
         weight[unmatched] = [1.0, 0.0, 0.0, 0.0]
         total = np.where(unmatched, 1.0, total)
     weight /= total[:, None]
-    return texel, weight.astype(np.float32), int(unmatched.sum())
+    return texel, weight.astype(np.float32), unmatched
 
 
 def _all_faces(body: Body) -> Array:
