@@ -26,6 +26,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
+from rich.console import Console
 from rich.progress import track
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
@@ -226,7 +227,7 @@ def main() -> None:
             part.write_text(json.dumps(rows, indent=1) + "\n")
     with atomic_write(file.with_suffix(".md")) as part:
         part.write_text(table(rows))
-    print(table(rows))
+    Console().print(table(rows), markup=False, highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

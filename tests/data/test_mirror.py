@@ -17,7 +17,7 @@ def test_mirrored_linear_field_matches_the_closed_form(name):
     """Offsets A x at x become F A F x: blending corners is exact for what is linear."""
     rest = np.asarray(template(name).mesh.vertices, np.float64)
     told = np.float32(np.stack([rest @ FIELD.T, -2.0 * rest @ FIELD.T]))
-    seen = mirrored_offsets(name, told)
+    seen = mirrored_offsets(template(name), told)
     wanted = rest @ (FLIP @ FIELD @ FLIP).T
     away = np.abs(seen - np.stack([wanted, -2.0 * wanted]))
     # As far apart as the halves of the template are.
@@ -35,6 +35,6 @@ def test_motion_and_cloth_are_mirrored_together():
     twin = mirrored_sequence(body, told)
     assert (twin.name, twin.split, twin.meta) == (told.name, told.split, told.meta)
     np.testing.assert_allclose(twin.motion.root, np.asarray(motion.root) * [-1.0, 1.0, 1.0])
-    np.testing.assert_array_equal(twin.offsets["top"], mirrored_offsets("top", offsets))
+    np.testing.assert_array_equal(twin.offsets["top"], mirrored_offsets(template("top"), offsets))
     back = mirrored_sequence(body, twin)
     np.testing.assert_allclose(back.motion.root, motion.root)

@@ -425,7 +425,7 @@ def test_exploded_simulation_does_not_stop_a_build(tmp_path, monkeypatch):
     monkeypatch.setattr(_build, "simulate_batch", lambda *a, **k: [rollout])
     action = Action("train", "walk", "a.npz", 0.0, 3, None)
     config = DatasetConfig(templates=("top",))
-    _build._simulate(config, tmp_path, "top", ((action,),), tmp_path, None)
+    _build._simulate(config, tmp_path, _build._Clothes("top"), ((action,),), tmp_path, None)
     meta = read_sequence(tmp_path / "walk").meta["top"]
     assert not meta["finite"] and not usable_garment(meta)
     assert meta["worst"] == {"strain_max": pytest.approx(0.3)}

@@ -38,8 +38,8 @@ def stream(lengths, *, capacity, batch=8, seed=3, mirrored=False, reads=None):
     entries, begin = [], 1
     for k, n in enumerate(lengths):
         motion = load_motion("walk")
-        s = _Numbers(f"a{k}", "train", motion, {}, {}, np.arange(begin, begin + n))
-        entries.append(Entry(s.name, "train", n, 30.0, "", s))
+        s = _Numbers(f"a{k}", "train", motion, {}, {}, numbers=np.arange(begin, begin + n))
+        entries.append(Entry(s.name, s.name, "train", n, 30.0, "", s))
         begin += n
     if mirrored:
         entries += [dataclasses.replace(e, mirrored=True) for e in entries]

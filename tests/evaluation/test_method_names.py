@@ -31,7 +31,7 @@ def test_mirror_suffix_makes_predictions_mirror_symmetric():
     for name in ("nano", "nano+mirror"):
         method = method_by_name(name)
         one, two = (method(m, "top").positions - s for m, s in zip((walk, twin), skinned))
-        away[name] = np.linalg.norm(one - mirrored_offsets("top", two), axis=-1).mean()
+        away[name] = np.linalg.norm(one - mirrored_offsets(template("top"), two), axis=-1).mean()
     # What is left is sampling: the meshes of both halves aren't the same.
     assert away["nano+mirror"] < 0.3e-3 < 2e-3 < away["nano"]
 

@@ -12,6 +12,7 @@ from ._frames import (
     usable_garment as usable_garment,
 )
 from ._mirror import mirrored_offsets as mirrored_offsets, mirrored_sequence as mirrored_sequence
+from ._outfit import Outfit as Outfit
 from ._protocol import (
     Action as Action,
     left_out as left_out,

@@ -1,5 +1,6 @@
 """Builds a dataset: simulates every action with every template."""
 
+import dataclasses
 import functools
 import math
 import pathlib
@@ -13,7 +14,7 @@ import numpy as np
 
 from ..body import Body
 from ..errors import FormatError
-from ..garment import Template, template
+from ..garment import Garment, Template, template
 from ..jobs import Job, Report, run_jobs
 from ..motion import (
     Motion,
@@ -24,10 +25,18 @@ from ..motion import (
     mirrored,
     with_upper_body,
 )
-from ..simulation import PreparedScene, Rollout, Scene, prepare_scene, simulate_batch
+from ..simulation import (
+    PreparedScene,
+    Rollout,
+    Scene,
+    prepare_scene,
+    simulate_batch,
+    standard_effects,
+)
 from ..simulation.blender import simulate_blender
 from ._config import CARD, DatasetConfig
-from ._files import join
+from ._files import join, last_name
+from ._outfit import Outfit
 from ._protocol import FPS, Action, left_out, load_action, read_protocol
 from ._store import (
     QUANTIZATION_STEP,
@@ -36,6 +45,7 @@ from ._store import (
     open_dataset,
     read_note,
     remove_index,
+    sequence_name,
     write_action,
     write_garment,
     write_offsets,
@@ -108,32 +118,34 @@ def build_dataset(
                 f"upper_from is {config.upper_from}: with {number} actions in the split"
                 f" '{split}', that is the action itself."
             )
+    everyone = actions
     actions = [a for a in actions if not only or a.name in only]
     open_dataset(root, _note(config))
-    own_groups = _groups(config, actions)[shard[0] :: shard[1]]
     # A group for each device; a job on a cluster has one.
     width = len(jax.local_devices()) if ray is None and config.engine == "physxnet" else 1
     jobs, count = [], 0
-    for name in config.templates:
-        stored = {a: is_stored(join(root, a.slug), name) for g in own_groups for a in g}
+    for clothes in _all_clothes(config):
+        own_groups = _groups(config, _wearing(config, clothes, everyone, actions))
+        own_groups = own_groups[shard[0] :: shard[1]]
+        stored = {a: clothes.is_stored(root, a) for g in own_groups for a in g}
         count += sum(not s for s in stored.values())
         missing = [g for g in own_groups if not all(stored[a] for a in g)]
         for at in range(0, len(missing), width):
             groups = tuple(missing[at : at + width])
-            label = f"{', '.join(a.name for g in groups for a in g)}: {name}"
-            jobs.append(Job(label, _simulate, (config, root, name, groups, folder, ask)))
+            label = f"{', '.join(a.name for g in groups for a in g)}: {clothes.label}"
+            jobs.append(Job(label, _simulate, (config, root, clothes, groups, folder, ask)))
     if jobs:
         remove_index(root)
     for _, lines in run_jobs(jobs, ray=ray, report=report):
-        for slug, line in lines:
-            write_times(root, slug, line["template"], line)
+        for slug, kind, line in lines:
+            write_times(root, slug, kind, line)
     # Of several shards the last one lists all.
     index_dataset(root)
     return count
 
 
 def expected_frames(root: Where, folder: str | pathlib.Path) -> dict[str, int]:
-    """Expected number of frames of each action, from the dataset's own settings.
+    """Expected number of frames of each sequence, from the dataset's own settings.
 
     Args:
         root: Folder or URL of the dataset.
@@ -143,7 +155,71 @@ def expected_frames(root: Where, folder: str | pathlib.Path) -> dict[str, int]:
     actions = _actions_in_splits(folder, note["splits"])
     if note.get("left_out", False):
         actions = left_out(folder, actions)
-    return {a.name: frames_at_speed(a.frames, note.get("speed", 1.0)) for a in actions}
+    frames = {a.name: frames_at_speed(a.frames, note.get("speed", 1.0)) for a in actions}
+    count = len(note.get("outfits", ()))
+    if not count:
+        return frames
+    each, first = note.get("outfits_each", 1), note.get("first_outfit", 0)
+    return {
+        sequence_name(a.name, number): frames[a.name]
+        for k, a in enumerate(actions)
+        for number in _outfits_of(k, count, each, first)
+    }
+
+
+def _outfits_of(action: int, count: int, each: int, first: int) -> list[int]:
+    """Numbers of the outfits of an action, given its place among all actions."""
+    return [(first + action * each + j) % count for j in range(each)]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Clothes:
+    """What is simulated together: a template, or the outfit of a number."""
+
+    name: str
+    outfit: Outfit | None = None
+    number: int = 0
+
+    @property
+    def label(self) -> str:
+        return self.name if self.outfit is None else " and ".join(self.outfit.wear)
+
+    @property
+    def garments(self) -> dict[str, Garment]:
+        if self.outfit is not None:
+            return self.outfit.garments()
+        return {self.name: template(self.name)}  # pyright: ignore[reportArgumentType]
+
+    def array(self, garment: str) -> str:
+        """The name under which a garment of it is stored."""
+        return garment if self.outfit is None else f"{garment}-{self.number:02d}"
+
+    def folder(self, root: Where, action: Action) -> str:
+        """The folder of an action in it."""
+        return join(
+            root, action.slug if self.outfit is None else f"{action.slug}-{self.number:02d}"
+        )
+
+    def is_stored(self, root: Where, action: Action) -> bool:
+        folder = self.folder(root, action)
+        return all(is_stored(folder, self.array(name)) for name in self.garments)
+
+
+def _all_clothes(config: DatasetConfig) -> list[_Clothes]:
+    if config.outfits:
+        return [_Clothes(" and ".join(o.wear), o, k) for k, o in enumerate(config.outfits)]
+    return [_Clothes(name) for name in config.templates]
+
+
+def _wearing(
+    config: DatasetConfig, clothes: _Clothes, everyone: list[Action], actions: list[Action]
+) -> list[Action]:
+    """Those of the actions that are simulated in some clothes."""
+    if clothes.outfit is None:
+        return actions
+    numbers = (len(config.outfits), config.outfits_each, config.first_outfit)
+    places = {a: k for k, a in enumerate(everyone)}
+    return [a for a in actions if clothes.number in _outfits_of(places[a], *numbers)]
 
 
 def _actions_in_splits(folder: str | pathlib.Path, splits: Collection[str]) -> list[Action]:
@@ -169,9 +245,13 @@ def _note(config: DatasetConfig) -> dict[str, Any]:
 
 def _changes(config: DatasetConfig) -> dict[str, Any]:
     """Settings that differ from their defaults; datasets of earlier versions don't list them."""
-    changes = {k: getattr(config, k) for k in ("left_out", "upper_from", "exaggerate", "people")}
+    names = ("left_out", "upper_from", "exaggerate", "people", "outfits_each", "first_outfit")
+    changes = {k: getattr(config, k) for k in names}
     defaults = DatasetConfig()
-    return {k: v for k, v in changes.items() if v != getattr(defaults, k)}
+    out = {k: v for k, v in changes.items() if v != getattr(defaults, k)}
+    return out | (
+        {"outfits": [dataclasses.asdict(o) for o in config.outfits]} if config.outfits else {}
+    )
 
 
 def _groups(config: DatasetConfig, actions: list[Action]) -> list[tuple[Action, ...]]:
@@ -183,37 +263,41 @@ def _groups(config: DatasetConfig, actions: list[Action]) -> list[tuple[Action, 
 
 
 @functools.lru_cache(maxsize=1)
-def _prepared(name: Template) -> PreparedScene:
+def _prepared(clothes: _Clothes) -> PreparedScene:
     # Programs compiled for the previous garment are no longer needed.
     jax.clear_caches()
-    return prepare_scene(Scene((template(name),)))
+    garments = tuple(clothes.garments.values())
+    if clothes.outfit is None:
+        return prepare_scene(Scene(garments))
+    effects = standard_effects(garments)
+    return prepare_scene(Scene(garments, effects, None, clothes.outfit.params()))
 
 
 def _simulate(
     config: DatasetConfig,
     root: Where,
-    name: Template,
+    clothes: _Clothes,
     groups: tuple[tuple[Action, ...], ...],
     folder: pathlib.Path,
     ask: Ask | None,
-) -> list[tuple[str, dict[str, Any]]]:
-    """Stores a garment in groups of actions, one for each device; returns what each took."""
+) -> list[tuple[str, str, dict[str, Any]]]:
+    """Stores clothes in groups of actions, one for each device; returns what each took."""
     group = tuple(action for g in groups for action in g)
-    scene = _prepared(name)
-    assembly = scene.assembly
-    write_garment(root, name, assembly.rest, np.asarray(assembly.faces))
-    motions = [action_motion(config, a, assembly.body, folder) for a in group]
+    scene = _prepared(clothes)
+    _write_garments(root, clothes, scene)
+    motions = [action_motion(config, a, scene.assembly.body, folder) for a in group]
     for action, motion in zip(group, motions):
-        write_action(join(root, action.slug), motion, action.split)
+        place = clothes.folder(root, action)
+        write_action(place, motion, action.split, clothes.outfit, clothes.number)
     start = time.perf_counter()
     if ask is not None:
         rollouts = []
         for motion in motions:
-            cloth = ask(motion, name)
+            cloth = ask(motion, clothes.name)  # pyright: ignore[reportArgumentType]
             finite = np.asarray(np.isfinite(cloth).all(axis=(1, 2)))
             rollouts.append(Rollout((cloth,), motion.fps, {"finite": finite}))
     elif config.engine == "blender":
-        one = Scene((template(name),))
+        one = Scene(tuple(clothes.garments.values()))
         rollouts = [simulate_blender(one, m, settings=config.blender) for m in motions]
     else:
         # Every group has the same size, since another size is another program.
@@ -224,34 +308,44 @@ def _simulate(
     seconds = round((time.perf_counter() - start) / len(group), 2)
     lines = []
     for action, motion, rollout in zip(group, motions, rollouts):
-        _store(config, join(root, action.slug), name, motion, rollout, scene)
-        line = {"action": action.name, "template": name, "frames": motion.num_frames}
-        lines.append((action.slug, line | {"seconds": seconds}))
+        place = clothes.folder(root, action)
+        _store(config, place, clothes, motion, rollout, scene)
+        line = {"action": action.name, "template": clothes.name, "frames": motion.num_frames}
+        kind = clothes.name if clothes.outfit is None else "outfit"
+        lines.append((last_name(place), kind, line | {"seconds": seconds}))
     return lines
+
+
+def _write_garments(root: Where, clothes: _Clothes, scene: PreparedScene) -> None:
+    a, start = scene.assembly, 0
+    for name, garment in clothes.garments.items():
+        rest = a.rest[start : start + garment.num_vertices]
+        write_garment(root, clothes.array(name), rest, np.asarray(garment.mesh.faces))
+        start += garment.num_vertices
 
 
 def _store(
     config: DatasetConfig,
     target: Where,
-    name: Template,
+    clothes: _Clothes,
     motion: Motion,
     rollout: Rollout,
     scene: PreparedScene,
 ) -> None:
-    offsets = rollout.positions[0] - skinned_cloth(scene, motion)
+    every = np.concatenate(rollout.positions, axis=1) - skinned_cloth(scene, motion)
     # JSON has no infinity and no NaN.
     worst = {k: v for k, v in rollout.worst.items() if math.isfinite(v)}
-    finite = bool(np.isfinite(offsets).all() and rollout.finite.all())
-    if not np.isfinite(offsets).all() or np.abs(offsets).max() > 3.0:
+    finite = bool(np.isfinite(every).all() and rollout.finite.all())
+    if not np.isfinite(every).all() or np.abs(every).max() > 3.0:
         # Recorded as failed: one diverged simulation doesn't stop a build.
-        offsets = np.zeros_like(offsets)
+        every = np.zeros_like(every)
         finite = False
-    write_offsets(
-        target,
-        name,
-        offsets,
-        {**config.settings(), "fps": motion.fps, "finite": finite, "worst": worst},
-    )
+    meta = {**config.settings(), "fps": motion.fps, "finite": finite, "worst": worst}
+    start = 0
+    for name, garment in clothes.garments.items():
+        offsets = every[:, start : start + garment.num_vertices]
+        write_offsets(target, clothes.array(name), offsets, meta)
+        start += garment.num_vertices
 
 
 def action_motion(

@@ -7,6 +7,7 @@ from ..errors import check_counts, check_numbers
 from ..garment import TEMPLATES, Template
 from ..simulation import XPBD
 from ..simulation.blender import BlenderSettings
+from ._outfit import Outfit
 
 SPLITS = ("train", "test", "extra")
 """Splits of the protocol."""
@@ -27,7 +28,11 @@ class DatasetConfig:
         engine: ``physxnet`` (this package's simulator), ``blender`` (the paper's) or
             ``network``: predictions of trained networks, as targets for another one.
         splits: Splits of the protocol: ``train``, ``test``, ``extra``.
-        templates: Garments, each simulated separately.
+        templates: Garments, each simulated separately; without outfits.
+        outfits: Outfits of the tailor, in place of ``templates``; with the ``physxnet`` engine.
+        outfits_each: How many of them each action is simulated in, one after another: the first
+            action in the first ones, the second in those that follow, and so on.
+        first_outfit: Where the first action begins.
         left_out: Use the frames of the actions' clips that the protocol leaves out instead of
             the actions themselves, see `left_out`.
         mirror: Exchange left and right in every motion.
@@ -45,6 +50,9 @@ class DatasetConfig:
     engine: Literal["physxnet", "blender", "network"] = "physxnet"
     splits: tuple[str, ...] = ("train", "test")
     templates: tuple[Template, ...] = TEMPLATES
+    outfits: tuple[Outfit, ...] = ()
+    outfits_each: int = 1
+    first_outfit: int = 0
     left_out: bool = False
     mirror: bool = False
     speed: float = 1.0
@@ -63,7 +71,14 @@ class DatasetConfig:
         ):
             if not given or set(given) - set(known):
                 raise ValueError(f"{name} are {given}; there are {', '.join(known)}.")
-        check_counts(self, "people")
+        check_counts(self, "people", "outfits_each")
+        if self.outfits and (self.engine != "physxnet" or self.templates != TEMPLATES):
+            raise ValueError("outfits need the engine 'physxnet', and take the place of templates.")
+        if self.outfits_each > max(len(self.outfits), 1) or self.first_outfit < 0:
+            raise ValueError(
+                f"outfits_each is {self.outfits_each}, first_outfit {self.first_outfit}; there are"
+                f" {len(self.outfits)} outfits."
+            )
         if self.people > 1 and self.engine != "physxnet":
             raise ValueError(f"people is {self.people}; the engine '{self.engine}' takes 1.")
         if (self.engine == "network") != bool(self.networks):

@@ -22,9 +22,11 @@ from jaxtyping import Float, Int
 
 from ..errors import FormatError
 from ..files import read_arrays
+from ..garment import Garment, template
 from ..motion import Motion, make_motion
 from ._codec import Codec, make_codec
 from ._files import join, last_name, list_files, open_array, read_file, remove_file, write_file
+from ._outfit import Outfit, read_outfit
 
 Where = str | pathlib.Path
 """A path or a URL."""
@@ -38,7 +40,8 @@ _NOTE, _ACTION, _ARRAY, _MOTION = "dataset.json", "action.json", "zarr.json", "m
 # Timings differ between runs: they aren't part of the dataset's digest.
 _TIMES, _OLD_LOG = "times", "build_log.jsonl"
 # Derived from the rest, so that it isn't part of the digest either.
-_INDEX, _INDEXED = "index.json", ("folder", "name", "split", "frames", "fps", "content")
+_INDEX = "index.json"
+_INDEXED = ("folder", "name", "action", "split", "frames", "fps", "content", "outfit")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,12 +49,13 @@ class Sequence:
     """One simulated action.
 
     Attributes:
-        name: Name of the action.
+        name: Name of the action; of an action in outfits followed by the outfit's number.
         split: ``train``, ``test`` or ``extra``.
-        motion: The body's motion.
+        motion: The body's motion, named after the action.
         offsets: For each template, cloth minus its linear blend skinning [m], shape
             [frames, vertices, 3].
         meta: Further metadata of each template: engine, settings, diagnostics.
+        outfit: What is worn; None for the templates on the default shape.
     """
 
     name: str
@@ -59,6 +63,13 @@ class Sequence:
     motion: Motion
     offsets: dict[str, Float[np.ndarray, "frames vertices 3"]]
     meta: dict[str, Any]
+    outfit: Outfit | None = None
+
+    def garment(self, name: str) -> Garment:
+        """The garment of a template."""
+        if self.outfit is None:
+            return template(name)  # pyright: ignore[reportArgumentType]
+        return self.outfit.garments()[name]
 
 
 def open_dataset(root: Where, note: dict[str, Any]) -> None:
@@ -308,8 +319,10 @@ def is_stored(folder: Where, template: str) -> bool:
     return read_file(join(folder, template), _ARRAY) is not None
 
 
-def write_action(folder: Where, motion: Motion, split: str) -> None:
-    """Writes the motion of an action and its split.
+def write_action(
+    folder: Where, motion: Motion, split: str, outfit: Outfit | None = None, number: int = 0
+) -> None:
+    """Writes the motion of an action, its split, and the outfit with its number.
 
     Raises:
         FormatError: The folder holds another motion, which its garments belong to, or another
@@ -338,7 +351,10 @@ def write_action(folder: Where, motion: Motion, split: str) -> None:
             f"{folder}: stored as '{_action_note(folder)['split']}', now '{split}'. A"
             " dataset whose splits changed must be rebuilt: choose another folder."
         )
-    write_file(folder, _ACTION, json.dumps({"name": motion.name, "split": split}).encode())
+    note: dict[str, Any] = {"name": motion.name, "split": split}
+    if outfit is not None:
+        note |= {"number": number, "outfit": dataclasses.asdict(outfit)}
+    write_file(folder, _ACTION, json.dumps(note).encode())
 
 
 def _read_motion(folder: Where, name: str = "") -> Motion:
@@ -354,19 +370,29 @@ def read_sequence(folder: Where) -> Sequence:
     Raises:
         FormatError: The folder doesn't hold an action.
     """
-    split, motion, meta = read_description(folder)
-    offsets = {t: read_offsets(folder, t) for t in meta}
-    return Sequence(motion.name, split, motion, offsets, meta)
+    described = read_description(folder)
+    offsets = {template_of(x): read_offsets(folder, x) for x in _arrays(folder)}
+    return dataclasses.replace(described, offsets=offsets)
 
 
-def read_description(folder: Where) -> tuple[str, Motion, dict[str, dict[str, Any]]]:
-    """Split, motion and each garment's metadata of an action; its cloth isn't read."""
-    info = _action_note(folder)
+def template_of(array: str) -> str:
+    """The template of an array: its name without the outfit's number."""
+    return array.partition("-")[0]
+
+
+def _arrays(folder: Where) -> list[str]:
+    """Names of an action's arrays."""
     # The description of an array is written last: what lacks it is in progress or interrupted.
     parts = [name.split("/") for name in list_files(folder)]
-    found = [p[0] for p in parts if p[1:] == [_ARRAY]]
+    return [p[0] for p in parts if p[1:] == [_ARRAY]]
+
+
+def read_description(folder: Where) -> Sequence:
+    """An action with each garment's metadata; its cloth isn't read."""
+    info = _action_note(folder)
     motion = _read_motion(folder, info["name"])
-    return info["split"], motion, {t: read_meta(folder, t) for t in found}
+    meta = {template_of(x): read_meta(folder, x) for x in _arrays(folder)}
+    return Sequence(info["sequence"], info["split"], motion, {}, meta, info["outfit"])
 
 
 def list_sequences(root: Where, split: str | None = None) -> list[str]:
@@ -376,13 +402,20 @@ def list_sequences(root: Where, split: str | None = None) -> list[str]:
     return [f for f in folders if split is None or _action_note(f)["split"] == split]
 
 
-def _action_note(folder: Where) -> dict[str, str]:
+def _action_note(folder: Where) -> dict[str, Any]:
     found = read_file(folder, _ACTION)
     if found is None:
         raise FormatError(f"{folder}: no {_ACTION}, not an action of a dataset.")
     with _report_damage(join(folder, _ACTION)):
         parsed = json.loads(found)
-        return {"name": str(parsed["name"]), "split": str(parsed["split"])}
+        name, outfit = str(parsed["name"]), read_outfit(parsed.get("outfit"))
+        full = name if outfit is None else sequence_name(name, int(parsed["number"]))
+        return {"name": name, "sequence": full, "split": str(parsed["split"]), "outfit": outfit}
+
+
+def sequence_name(action: str, number: int) -> str:
+    """The name of an action in the outfit of a number."""
+    return f"{action} #{number:02d}"
 
 
 def write_index(root: Where, lines: list[dict[str, Any]]) -> None:

@@ -14,6 +14,7 @@ from jaxtyping import Int
 from ..errors import FormatError
 from ._files import join, last_name
 from ._frames import Frames, content_hash, take
+from ._outfit import Outfit, read_outfit
 from ._store import (
     Sequence,
     Where,
@@ -34,21 +35,25 @@ class Entry:
     """An action of which the cloth isn't read yet.
 
     Attributes:
-        name: Name of the action.
+        name: Name of the sequence, see `Sequence`.
+        action: Name of the action.
         split: ``train``, ``test`` or ``extra``.
         frames: Number of frames.
         fps: Frames per second.
         content: A short hash of its cloth.
         source: Its folder or URL, or the action itself.
+        outfit: What is worn; None for the templates.
         mirrored: Whether its mirror image is meant.
     """
 
     name: str
+    action: str
     split: str
     frames: int
     fps: float
     content: str
     source: Where | Sequence
+    outfit: Outfit | None = None
     mirrored: bool = False
 
     def read(self) -> Sequence:
@@ -61,11 +66,12 @@ def read_entry(source: Where | Sequence | Entry) -> Entry:
     if isinstance(source, Entry):
         return source
     if isinstance(source, Sequence):
-        motion, content = source.motion, content_hash(source.meta, source.offsets)
-        return Entry(source.name, source.split, motion.num_frames, motion.fps, content, source)
-    split, motion, meta = read_description(source)
-    content = content_hash(meta, None)
-    return Entry(motion.name, split, motion.num_frames, motion.fps, content, source)
+        s, content = source, content_hash(source.meta, source.offsets)
+    else:
+        s = read_description(source)
+        content = content_hash(s.meta, None)
+    m = s.motion
+    return Entry(s.name, m.name, s.split, m.num_frames, m.fps, content, source, s.outfit)
 
 
 def list_entries(root: Where, split: str | None = None) -> list[Entry]:
@@ -79,11 +85,13 @@ def list_entries(root: Where, split: str | None = None) -> list[Entry]:
     return [
         Entry(
             str(line["name"]),
+            str(line["action"]),
             str(line["split"]),
             int(line["frames"]),
             float(line["fps"]),
             str(line["content"]),
             join(root, str(line["folder"])),
+            read_outfit(line["outfit"]),
         )
         for line in lines
         if split is None or line["split"] == split
@@ -95,8 +103,10 @@ def index_dataset(root: Where) -> None:
     lines = []
     for folder in list_sequences(root):
         e = read_entry(folder)
-        line = {"folder": last_name(folder), "name": e.name, "split": e.split}
-        lines.append(line | {"frames": e.frames, "fps": e.fps, "content": e.content})
+        line = {"folder": last_name(folder), "name": e.name, "action": e.action, "split": e.split}
+        outfit = None if e.outfit is None else dataclasses.asdict(e.outfit)
+        line |= {"frames": e.frames, "fps": e.fps, "content": e.content, "outfit": outfit}
+        lines.append(line)
     write_index(root, lines)
 
 

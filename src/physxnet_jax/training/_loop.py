@@ -128,7 +128,7 @@ def _load_data(config: TrainConfig, sequences: Items[Sequence | Where | Entry]) 
     atlas, texel_points, tables = prepare_targets(config.model)
     entries = [read_entry(s) for s in sequences]
     held = [e.read() for e in _held_out(config, entries)]
-    used = [e for e in entries if e.name not in config.validation]
+    used = [e for e in entries if e.action not in config.validation]
     if config.mirror_augmentation:
         used += [dataclasses.replace(e, mirrored=True) for e in used]
     load = functools.partial(
@@ -293,14 +293,14 @@ class _Run:
 
 
 def _held_out(config: TrainConfig, sequences: Items[Entry]) -> list[Entry]:
-    names = {s.name for s in sequences}
+    names = {s.action for s in sequences}
     missing = [n for n in config.validation if n not in names]
     if missing:
         raise FormatError(
             f"validation actions {', '.join(missing)} aren't among the sequences:"
             f" {', '.join(sorted(names)) or 'none'}."
         )
-    return [s for s in sequences if s.name in config.validation]
+    return [s for s in sequences if s.action in config.validation]
 
 
 def _validate(

@@ -252,7 +252,8 @@ def skirt_samples(
         known = np.flatnonzero(valid)
         # Twice round, so that the seam is no border.
         grid = np.column_stack([known % columns, known // columns])
-        twice = np.concatenate([grid, grid + [columns, 0], grid - [columns, 0]])
+        turn_on = np.array([columns, 0])
+        twice = np.concatenate([grid, grid + turn_on, grid - turn_on])
         nearest = KDTree(twice).query(np.column_stack([x, y])[alone])[1] % len(known)
         texel[alone] = known[nearest][:, None]
         weight[alone] = [1.0, 0.0, 0.0, 0.0]

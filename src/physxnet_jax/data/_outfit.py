@@ -1,0 +1,80 @@
+"""Outfits: garments cut to measure for a person, worn together."""
+
+import dataclasses
+import functools
+from typing import Any
+
+import jax
+from jaxtyping import Array, Float
+
+from ..body import load_body
+from ..errors import PhysXNetError
+from ..garment import KINDS, Garment, parse_wear, tailor
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Outfit:
+    """Garments worn together, and the person who wears them.
+
+    Attributes:
+        wear: Garments of the tailor as `parse_wear` reads them, innermost first; one of each
+            template at most.
+        shape: The person's shape parameters, as ``name=value``.
+    """
+
+    wear: tuple[str, ...]
+    shape: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.wear:
+            raise ValueError("an outfit has no garment; list some in wear.")
+        for word in self.wear:
+            if parse_wear(word).name not in KINDS:
+                raise ValueError(f"the tailor makes no '{word}'; there are {', '.join(KINDS)}.")
+        for word in self.shape:
+            _, _, value = word.partition("=")
+            try:
+                float(value)
+            except ValueError:
+                raise ValueError(
+                    f"shape is '{word}', expected name=value, as in weight_up=0.5."
+                ) from None
+
+    def params(self) -> Float[Array, " shapes"]:
+        """The person's shape parameters, see `Body.shape`."""
+        pairs = (word.partition("=") for word in self.shape)
+        return load_body().shape(**{name: float(value) for name, _, value in pairs})
+
+    def garments(self) -> dict[str, Garment]:
+        """The garments by template, innermost first.
+
+        Raises:
+            PhysXNetError: Two garments of one template, or a measure out of range.
+        """
+        return _garments(self)
+
+
+@functools.lru_cache(maxsize=64)
+def _garments(outfit: Outfit) -> dict[str, Garment]:
+    out: dict[str, Garment] = {}
+    # Cached arrays mustn't be tracers of an enclosing transformation.
+    with jax.ensure_compile_time_eval():
+        params = outfit.params()
+        for word in outfit.wear:
+            item = parse_wear(word)
+            options: dict[str, Any] = {**item.measures, "fabric": item.fabric, "hold": item.hold}
+            garment = tailor(item.name, shape=params, **options)
+            if garment.template in out:
+                raise PhysXNetError(
+                    f"{', '.join(outfit.wear)}: two garments of the template"
+                    f" '{garment.template}'; an outfit of a dataset has one of each."
+                )
+            out[garment.template] = garment
+    return out
+
+
+def read_outfit(found: Any) -> Outfit | None:
+    """The outfit that an action stores; None for a template."""
+    if found is None:
+        return None
+    return Outfit(wear=tuple(map(str, found["wear"])), shape=tuple(map(str, found["shape"])))
