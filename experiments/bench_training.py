@@ -26,7 +26,7 @@ import numpy as np
 from rich.progress import Progress
 
 from physxnet_jax.body import load_body
-from physxnet_jax.data import Frames, Sequence, load_frames, take
+from physxnet_jax.data import Frames, Sequence, load_frames, make_wardrobe, take
 from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import TEMPLATES, template
 from physxnet_jax.models import PAPER, ModelConfig, Normalisation, Up
@@ -54,7 +54,6 @@ def plain_transposed(layer: Up, x: jax.Array) -> jax.Array:
 
 def walking_frames() -> Frames:
     """Frames of the built-in walk, each cloth on its skinning."""
-    body = load_body()
     motion = load_motion("walk", fps=30.0)
     still = {
         t: np.zeros((motion.num_frames, template(t).num_vertices, 3), np.float32) for t in TEMPLATES
@@ -62,9 +61,8 @@ def walking_frames() -> Frames:
     meta = {t: {"finite": True, "worst": {"penetration_max": 0.0}} for t in TEMPLATES}
     return load_frames(
         [Sequence("walk", "train", motion, still, meta)],
-        {t: template(t) for t in TEMPLATES},
-        body,
-        body.rest_vertices(body.default_shape()),
+        make_wardrobe([None], TEMPLATES),
+        load_body(),
         window=PAPER.window,
         local=False,
     )

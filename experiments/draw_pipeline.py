@@ -26,7 +26,7 @@ def main() -> None:
     body = px.load_body()
     rest = body.rest_vertices(body.default_shape())
     predictor = px.load_predictor()
-    size = predictor.config.resolution
+    atlas = predictor.atlas
     motion = load_motion("punch", fps=30.0)
     seen = predictor.config.inputs
     world, shift = (
@@ -37,10 +37,11 @@ def main() -> None:
     features = clip_features(surface.rest, surface.weights, world, shift, 30.0, seen)
     inputs = np.asarray(features)[0]
     outputs = predictor(world, shift, 30.0, predictor.config.templates)
-    texels = np.asarray(predictor.atlas.texels)
+    texels = np.asarray(atlas.texels)
     shown = [inputs[:, 6:9], inputs[:, 15:18], inputs[:, 18:21]]
     shown += [np.asarray(outputs[t][0]) for t in predictor.config.templates]
-    pictures = [magnified(texel_picture(x, texels, size), SIZE) for x in shown]
+    drawn = [texel_picture(x, texels, atlas.height, atlas.width) for x in shown]
+    pictures = [magnified(x, SIZE) for x in drawn]
     maps = np.concatenate([np.concatenate(pictures[:3], 1), np.concatenate(pictures[3:], 1)])
     clip = dress(motion, ["top", "bottom"], frames=FRAME + 1)
     mesh = render_frame(clip.meshes, FRAME, size=(512, 2 * SIZE))

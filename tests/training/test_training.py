@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physxnet_jax.data import Sequence, is_trainable
+from physxnet_jax.data import Sequence, is_trainable, make_wardrobe
 from physxnet_jax.data._frames import MAX_OFFSET, load_frames
 from physxnet_jax.devices import make_mesh
 from physxnet_jax.dressing import Inference
@@ -157,14 +157,14 @@ def test_trainable_offsets_are_bounded_tightly_except_for_dresses():
     assert all(is_trainable(data, t) for t in data.offsets), "near ones do"
 
 
-def test_empty_datasets_and_mixed_frame_rates_are_refused(body, rest):
+def test_empty_datasets_and_mixed_frame_rates_are_refused(body):
     usual = sequence()
     slow = dataclasses.replace(usual, motion=dataclasses.replace(usual.motion, fps=15.0))
-    garments = {"bottom": template("bottom")}
+    wardrobe = make_wardrobe([None], ("bottom",))
     for wrong, says in (((), "no sequence"), ((usual, slow), "different frame rates")):
         with pytest.raises(FormatError, match=says):
-            load_frames(iter(wrong), garments, body, rest, window=5, local=True)
-    assert len(load_frames(iter([usual]), garments, body, rest, window=5, local=True)) == 20
+            load_frames(iter(wrong), wardrobe, body, window=5, local=True)
+    assert len(load_frames(iter([usual]), wardrobe, body, window=5, local=True)) == 20
 
 
 @pytest.mark.release

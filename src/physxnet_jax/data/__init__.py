@@ -40,3 +40,4 @@ from ._stream import (
     list_entries as list_entries,
     read_entry as read_entry,
 )
+from ._wardrobe import Wardrobe as Wardrobe, make_wardrobe as make_wardrobe

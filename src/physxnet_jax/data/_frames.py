@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from ..body import Body
 from ..errors import FormatError
@@ -17,6 +17,7 @@ from ..geometry import polar_rotation
 from ..motion import clip_transforms
 from ..simulation import OFF
 from ._store import QUANTIZATION_STEP, Sequence
+from ._wardrobe import Wardrobe
 
 # Largest usable offsets from skinning [m]. Beyond the first, a sleeve or trouser leg is off its
 # limb. Skirts may swing further; beyond the second, they have come off. Targets must also fit
@@ -51,6 +52,8 @@ class Frames:
         targets: For each template, cloth offsets [0.1 mm], shape [frames, vertices, 3].
         usable: For each template, which frames are usable, shape [frames].
         fps: Frames per second.
+        garment: For each template the garment's number in the wardrobe, shape [frames].
+        person: The person's number there, shape [frames].
     """
 
     rotations: Float[np.ndarray, "frames window joints 3 3"]
@@ -58,6 +61,8 @@ class Frames:
     targets: dict[str, np.ndarray]
     usable: dict[str, Bool[np.ndarray, " frames"]]
     fps: float
+    garment: dict[str, Int[np.ndarray, " frames"]] = dataclasses.field(default_factory=dict)
+    person: Int[np.ndarray, " frames"] | None = None
 
     def __len__(self) -> int:
         return len(self.rotations)
@@ -81,9 +86,8 @@ def is_trainable(sequence: Sequence, name: str) -> bool:
 
 def load_frames(
     sequences: Iterable[Sequence],
-    garments: dict[str, Garment],
+    wardrobe: Wardrobe,
     body: Body,
-    rest: Float[Array, "all 3"],
     *,
     window: int,
     local: bool,
@@ -92,32 +96,41 @@ def load_frames(
 
     Targets are cloth offsets in the family's frame. For ``local``: cloth minus its
     skinning, in each cloth vertex's own frame. For ``paper``: cloth positions relative to
-    their skinning in the world frame (the skin is subtracted at the texels).
+    their skinning in the world frame (the skin is subtracted at the texels). Garments with fewer
+    vertices than the largest of their template are padded with zeros.
 
     Raises:
         FormatError: No sequences, or sequences of different frame rates.
     """
     rotations, translations = [], []
     rates: set[float] = set()
-    targets: dict[str, list] = {t: [] for t in garments}
-    usable: dict[str, list] = {t: [] for t in garments}
+    names, rests = wardrobe.garments, wardrobe.rests()
+    targets: dict[str, list] = {t: [] for t in names}
+    usable: dict[str, list] = {t: [] for t in names}
+    garment: dict[str, list] = {t: [] for t in names}
+    persons = []
     for s in sequences:
         rates.add(s.motion.fps)
         if len(rates) != 1:
             raise FormatError(f"sequences of different frame rates: {sorted(rates)}.")
-        world, shift = clip_transforms(body, rest, s.motion)
+        person = wardrobe.person(s.outfit)
+        world, shift = clip_transforms(body, rests[person], s.motion)
+        persons.append(np.full(len(world), person, np.int32))
         rotations.append(np.asarray(pose_windows(world, window)))
         translations.append(np.asarray(pose_windows(shift, window)))
-        for name, g in garments.items():
+        for name in names:
             trainable = is_trainable(s, name)
             usable[name].append(np.full(len(world), trainable))
+            number = wardrobe.numbers.get((name, s.outfit), 0)
+            garment[name].append(np.full(len(world), number, np.int32))
+            target = np.zeros((len(world), wardrobe.num_vertices(name), 3), dtype=np.int16)
+            targets[name].append(target)
             if not trainable:
-                targets[name].append(np.zeros((len(world), g.num_vertices, 3), dtype=np.int16))
                 continue
             offset = s.offsets[name]
             if local:
-                offset = _to_local(g, world, offset)
-            targets[name].append(np.round(offset / QUANTIZATION_STEP).astype(np.int16))
+                offset = _to_local(s.garment(name), world, offset)
+            target[:, : offset.shape[1]] = np.round(offset / QUANTIZATION_STEP)
     if not rotations:
         raise FormatError("no sequence to train on; build a dataset first.")
     cat = np.concatenate
@@ -125,9 +138,11 @@ def load_frames(
         cat(rotations),
         cat(translations),
         # Targets take gigabytes: parts are released as soon as they are concatenated.
-        {t: cat(targets.pop(t)) for t in garments},
+        {t: cat(targets.pop(t)) for t in names},
         {t: cat(v) for t, v in usable.items()},
         rates.pop(),
+        {t: cat(v) for t, v in garment.items()},
+        cat(persons),
     )
 
 
@@ -175,7 +190,11 @@ def take(frames: Frames, index: np.ndarray) -> dict[str, np.ndarray]:
         "rotations": frames.rotations[index],
         "translations": frames.translations[index],
     }
+    if frames.person is not None:
+        out["person"] = frames.person[index]
     for t in frames.targets:
         out[f"target_{t}"] = frames.targets[t][index]
         out[f"weight_{t}"] = frames.usable[t][index].astype(np.float32)
+        if t in frames.garment:
+            out[f"garment_{t}"] = frames.garment[t][index]
     return out

@@ -70,8 +70,8 @@ def read_entry(source: Where | Sequence | Entry) -> Entry:
     else:
         s = read_description(source)
         content = content_hash(s.meta, None)
-    m = s.motion
-    return Entry(s.name, m.name, s.split, m.num_frames, m.fps, content, source, s.outfit)
+    m, action = s.motion, s.name if s.outfit is None else s.motion.name
+    return Entry(s.name, action, s.split, m.num_frames, m.fps, content, source, s.outfit)
 
 
 def list_entries(root: Where, split: str | None = None) -> list[Entry]:

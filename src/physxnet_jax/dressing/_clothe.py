@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from ..body import Body, skin_points
-from ..models import apply_sampled_offsets, normalise, point_features
+from ..models import apply_sampled_offsets, normalise, point_features, predict_sampled
 from ..motion import extrapolate_history
 from ..typing import pytree
 from ._dresser import Dresser
@@ -214,16 +214,10 @@ def _predict_step(
     window = jnp.concatenate([stream.points, points[None]])
     features = point_features(window, blend[None], fps, inputs)
     features = normalise(features, predictor.normalisation, inputs)
-    worn = bound(dresser)
-    offsets = predictor.from_features(features, tuple(dict.fromkeys(w.template for w in worn)))
+    worn, family = bound(dresser), predictor.config.family
+    sampled = predict_sampled(predictor, worn, features)
     cloth = (
-        apply_sampled_offsets(
-            w,
-            rotations,
-            translations,
-            w.sample(offsets[w.template][0]),
-            predictor.config.family,
-        )[None]
-        for w in worn
+        apply_sampled_offsets(w, rotations, translations, offsets[0], family)[None]
+        for w, offsets in zip(worn, sampled, strict=True)
     )
     return Stream(points=window[1:]), tuple(cloth)

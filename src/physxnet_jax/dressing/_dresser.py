@@ -19,7 +19,7 @@ from ..models import (
     with_mirror_tta,
 )
 from ..typing import pytree
-from ..uv import bind
+from ..uv import bind, condition_maps
 from ._inference import Inference
 from ._meshes import Wear, resolve_garments
 from .postprocess import (
@@ -182,7 +182,7 @@ def with_body(predictor: Predictor, body: Body, rest: Float[Array, "all 3"]) -> 
         body: The body.
         rest: `Body.rest_vertices` of the shape [m].
     """
-    points = make_texel_points(predictor.atlas, body, rest, predictor.texel_points.valid)
+    points = make_texel_points(predictor.motion_atlas, body, rest, predictor.texel_points.valid)
     return dataclasses.replace(predictor, texel_points=points)
 
 
@@ -213,13 +213,13 @@ def bind_to_predictor(
     # Garments are modelled, and therefore bound, on the default shape.
     base = body.rest_vertices(body.default_shape())
     valid = predictor.texel_points.valid[garment.template]
-    return bind_garment(
-        body,
-        rest,
-        garment,
-        bind(garment, atlas=predictor.atlas, body=body, rest=base, valid=valid),
-        smooth=not predictor.config.skirt_chart,
-    )
+    atlas, config = predictor.atlas, predictor.config
+    binding = bind(garment, atlas=atlas, body=body, rest=base, valid=valid)
+    worn = bind_garment(body, rest, garment, binding, smooth=not config.skirt_chart)
+    if not config.conditions:
+        return worn
+    conditions = condition_maps(atlas, body, base, garment, binding)
+    return dataclasses.replace(worn, modulation=predictor.modulation(garment.template, conditions))
 
 
 def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
@@ -257,7 +257,9 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
         skirts = any(w.template == "dress" for w in worn)
         if skirts and predictor.config.family == "paper":
             raise ValueError("dresses of the paper family: use make_dresser(..., shape=shape).")
-        points = dataclasses.replace(predictor.texel_points, rest=predictor.atlas.at_texels(rest))
+        points = dataclasses.replace(
+            predictor.texel_points, rest=predictor.motion_atlas.at_texels(rest)
+        )
         predictor = dataclasses.replace(predictor, texel_points=points)
         worn = tuple(
             dataclasses.replace(w, anchor=w.binding.to_body @ rest)

@@ -12,8 +12,8 @@ import optax
 from jaxtyping import Array, Float
 
 from ..body import Body, load_body
-from ..data import QUANTIZATION_STEP, Frames, Sequence, load_frames
-from ..garment import Template, template
+from ..data import QUANTIZATION_STEP, Frames, Sequence, load_frames, make_wardrobe
+from ..garment import Template
 from ._methods import Blockwise, place_local, rest_and_skin
 
 _HIDDEN = 512
@@ -55,9 +55,7 @@ def _pose_data(frames: Frames, body: Body, name: Template) -> _PoseData:
 
 def training_frames(sequences: Items[Sequence], names: Items[Template]) -> Frames:
     """Loads training frames with targets in vertex-local frames."""
-    body = load_body()
-    rest = body.rest_vertices(body.default_shape())
-    return load_frames(sequences, {t: template(t) for t in names}, body, rest, window=1, local=True)
+    return load_frames(sequences, make_wardrobe([None], names), load_body(), window=1, local=True)
 
 
 def nearest_frame(frames: Frames) -> Blockwise:

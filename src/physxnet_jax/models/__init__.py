@@ -8,6 +8,7 @@ from ._bound_garment import (
     bind_garment as bind_garment,
     dress_frames as dress_frames,
     pad_clip as pad_clip,
+    predict_sampled as predict_sampled,
 )
 from ._features import (
     PAPER as PAPER,
@@ -18,7 +19,11 @@ from ._features import (
 )
 from ._fold import at_precision as at_precision, fold_batch_norm as fold_batch_norm
 from ._mean import average_networks as average_networks
-from ._networks import Discriminator as Discriminator, Generator as Generator
+from ._networks import (
+    Discriminator as Discriminator,
+    Generator as Generator,
+    Modulation as Modulation,
+)
 from ._predictor import (
     ModelConfig as ModelConfig,
     Normalisation as Normalisation,

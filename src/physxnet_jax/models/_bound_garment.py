@@ -13,8 +13,9 @@ from ..garment import Garment, SkinnedGarment
 from ..geometry import Smoothing, gaussian_smoothing, polar_rotation
 from ..typing import pytree
 from ..uv import Binding, dress_body
-from ._features import Family, FeatureConfig
-from ._predictor import Predictor
+from ._features import Family, FeatureConfig, clip_features
+from ._networks import Modulation
+from ._predictor import Predictor, normalise
 
 _EXACT = jax.lax.Precision.HIGHEST
 # Distance along the cloth over which offsets are averaged [m]: texels are wider than the vertex
@@ -33,12 +34,15 @@ class BoundGarment(SkinnedGarment):
         anchor_weights: Their skinning weights, shape [vertices, joints].
         smoothing: Averages sampled offsets over neighbouring vertices; None to sample maps as they
             are.
+        modulation: What the garment changes in its decoder, see `Predictor.modulation`; None for
+            networks that don't see the garment.
     """
 
     binding: Binding
     anchor: Float[Array, "vertices 3"]
     anchor_weights: Float[Array, "vertices joints"]
     smoothing: Smoothing | None
+    modulation: Modulation | None = None
 
     def sample(
         self, values: Float[Array, "*batch texels channels"]
@@ -149,16 +153,44 @@ def dress_frames(
     Returns:
         Vertex positions of each garment [m].
     """
-    templates = tuple(dict.fromkeys(w.template for w in bound_garments))
-    offsets = predictor(rotations, translations, fps, templates)
+    inputs = predictor.config.inputs
+    points = predictor.texel_points
+    features = clip_features(points.rest, points.weights, rotations, translations, fps, inputs)
+    sampled = predict_sampled(
+        predictor, bound_garments, normalise(features, predictor.normalisation, inputs)
+    )
     family: Family = predictor.config.family
-    last = slice(predictor.config.inputs.window - 1, None)
+    last = slice(inputs.window - 1, None)
     return tuple(
         jax.vmap(lambda r, t, o, w=w: apply_sampled_offsets(w, r, t, o, family))(
-            rotations[last], translations[last], w.sample(offsets[w.template])
+            rotations[last], translations[last], offsets
         )
-        for w in bound_garments
+        for w, offsets in zip(bound_garments, sampled, strict=True)
     )
+
+
+def predict_sampled(
+    predictor: Predictor,
+    bound_garments: Sequence[BoundGarment],
+    features: Float[Array, "batch texels channels"],
+) -> tuple[Float[Array, "batch vertices 3"], ...]:
+    """Offsets [m] at the vertices of garments, from normalised features, in one pass.
+
+    Garments of one template have one map, unless the network sees the garment.
+    """
+    out: dict[int, Array] = {}
+    waiting = list(enumerate(bound_garments))
+    while waiting:
+        # The compiler computes the encoder, which all rounds share, once.
+        now: dict[str, tuple[int, BoundGarment]] = {}
+        for k, w in waiting:
+            now.setdefault(w.template, (k, w))
+        known = {t: w.modulation for t, (_, w) in now.items() if w.modulation is not None}
+        offsets = predictor.from_features(features, tuple(now), known or None)
+        served = [k for k, w in waiting if not known or now[w.template][0] == k]
+        out |= {k: bound_garments[k].sample(offsets[bound_garments[k].template]) for k in served}
+        waiting = [(k, w) for k, w in waiting if k not in out]
+    return tuple(out[k] for k in range(len(bound_garments)))
 
 
 def pad_clip(

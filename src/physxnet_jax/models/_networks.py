@@ -1,7 +1,7 @@
 """The generator (one encoder, one decoder per template) and the PatchGAN discriminator."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 from flax import nnx
@@ -12,29 +12,85 @@ from ._blocks import Down, Up
 LEVELS = 4
 
 
-class Decoder(nnx.Module):
-    """Four upsampling layers with skip connections from the encoder, ending in an offset map."""
+Modulation = tuple[tuple[Array, Array], ...]
+"""Scale and shift of each hidden layer of a decoder, shapes [batch, h, w, channels]."""
 
-    def __init__(self, width: int, *, rngs: nnx.Rngs) -> None:
-        deep = [width * 2**k for k in range(LEVELS)]
+_CONDITION_WIDTH = 16
+
+
+class Modulator(nnx.Module):
+    """From maps of a garment to the scales and shifts of a decoder's hidden layers.
+
+    Args:
+        conditions: Channels of the maps.
+        widths: Channels of the hidden layers, coarsest first.
+        rngs: Random streams for the initial parameters.
+
+    References:
+        Perez et al., FiLM (2018), with a scale and a shift of their own at every texel.
+    """
+
+    def __init__(self, conditions: int, widths: Sequence[int], *, rngs: nnx.Rngs) -> None:
+        sizes = [conditions, *(_CONDITION_WIDTH for _ in widths)]
         self.layers = nnx.List(
+            [Down(a, b, norm=False, slope=0.2, rngs=rngs) for a, b in itertools.pairwise(sizes)]
+        )
+        # At first every layer is left as it is.
+        zeros = nnx.initializers.zeros_init()
+        self.heads = nnx.List(
             [
-                Up(deep[3], deep[2], rngs=rngs),
-                Up(2 * deep[2], deep[1], rngs=rngs),
-                Up(2 * deep[1], deep[0], rngs=rngs),
-                Up(2 * deep[0], 3, norm=False, rngs=rngs),
+                nnx.Conv(_CONDITION_WIDTH, 2 * w, (1, 1), kernel_init=zeros, rngs=rngs)
+                for w in reversed(widths)
             ]
         )
 
+    def __call__(self, conditions: Float[Array, "batch height width channels"]) -> Modulation:
+        """Scales and shifts, coarsest first."""
+        x, out = conditions, []
+        for layer, head in zip(self.layers, self.heads, strict=True):
+            x = layer(x)
+            scale, shift = jnp.split(head(x), 2, axis=-1)
+            out.append((scale, shift))
+        return tuple(reversed(out))
+
+
+class Decoder(nnx.Module):
+    """Upsampling layers with skip connections from the encoder, ending in an offset map.
+
+    Args:
+        width: Channels of the encoder's first layer.
+        finer: Whether the map has twice the resolution of the encoder's input.
+        conditions: Channels of maps that describe the garment; 0 for none.
+        rngs: Random streams for the initial parameters.
+    """
+
+    def __init__(
+        self, width: int, *, finer: bool = False, conditions: int = 0, rngs: nnx.Rngs
+    ) -> None:
+        deep = [width * 2**k for k in range(LEVELS)]
+        widths = [deep[2], deep[1], deep[0], *([max(width // 2, 4)] if finer else [])]
+        inputs = [deep[3], 2 * deep[2], 2 * deep[1], 2 * deep[0], *(widths[3:])]
+        self.layers = nnx.List(
+            [Up(a, b, norm=b != 3, rngs=rngs) for a, b in zip(inputs, [*widths, 3], strict=True)]
+        )
+        self.modulator = Modulator(conditions, widths, rngs=rngs) if conditions else None
+
     def __call__(
-        self, features: Sequence[Float[Array, "batch _h _w _c"]]
+        self,
+        features: Sequence[Float[Array, "batch _h _w _c"]],
+        modulation: Modulation | None = None,
     ) -> Float[Array, "batch height width 3"]:
         """A map of normalised offsets from the encoder's features, finest first."""
         x = features[-1]
         for k, layer in enumerate(self.layers):
             x = layer(x)
+            if k == len(self.layers) - 1:
+                break
+            if modulation is not None:
+                scale, shift = modulation[k]
+                x = x + (x * scale.astype(x.dtype) + shift.astype(x.dtype))
+            x = jnp.where(x > 0, x, 0.0)
             if k < LEVELS - 1:
-                x = jnp.where(x > 0, x, 0.0)
                 x = jnp.concatenate([x, features[LEVELS - 2 - k]], axis=-1)
         return x
 
@@ -42,12 +98,15 @@ class Decoder(nnx.Module):
 class Generator(nnx.Module):
     """G, from maps of body motion to maps of garment offsets.
 
-    Only the requested decoders are computed.
+    Only the requested decoders are computed. What depends on a garment alone, its `modulation`,
+    enters the decoders and is computed once.
 
     Args:
         channels: Input channels (18 for `paper`, 24 for `local`).
         templates: Templates that get a decoder.
         width: Channels of the first layer; doubled at each of four levels.
+        finer: Whether offset maps have twice the resolution of motion maps.
+        conditions: Channels of maps that describe a garment; 0 for none.
         rngs: Random streams for the initial parameters.
 
     Example:
@@ -60,18 +119,43 @@ class Generator(nnx.Module):
     """
 
     def __init__(
-        self, channels: int, templates: Sequence[str], *, width: int = 32, rngs: nnx.Rngs
+        self,
+        channels: int,
+        templates: Sequence[str],
+        *,
+        width: int = 32,
+        finer: bool = False,
+        conditions: int = 0,
+        rngs: nnx.Rngs,
     ) -> None:
         sizes = [channels, *(width * 2**k for k in range(LEVELS))]
         self.encoder = nnx.List([Down(a, b, rngs=rngs) for a, b in itertools.pairwise(sizes)])
-        self.decoders = nnx.Dict({t: Decoder(width, rngs=rngs) for t in templates})
+        self.decoders = nnx.Dict(
+            {t: Decoder(width, finer=finer, conditions=conditions, rngs=rngs) for t in templates}
+        )
+
+    def modulation(
+        self, template: str, conditions: Float[Array, "batch height width channels"]
+    ) -> Modulation:
+        """What a garment's maps change in the decoder of its template."""
+        modulator = self.decoders[template].modulator
+        if modulator is None:
+            raise ValueError("this network takes no maps of garments.")
+        return modulator(conditions)
 
     def __call__(
         self,
         x: Float[Array, "batch height width channels"],
         templates: Sequence[str],
-    ) -> dict[str, Float[Array, "batch height width 3"]]:
+        modulation: Mapping[str, Modulation] | None = None,
+    ) -> dict[str, Float[Array, "batch h w 3"]]:
         """Normalised offset maps of the requested templates.
+
+        Args:
+            x: Maps of motion.
+            templates: Templates whose maps to compute.
+            modulation: Of the garment of each template, see `modulation`; only for a network with
+                conditions.
 
         Raises:
             ValueError: A size that isn't a multiple of 16.
@@ -85,7 +169,8 @@ class Generator(nnx.Module):
         for layer in self.encoder:
             x = layer(x)
             features.append(x)
-        return {t: self.decoders[t](features) for t in templates}
+        known = modulation or {}
+        return {t: self.decoders[t](features, known.get(t)) for t in templates}
 
 
 class Discriminator(nnx.Module):

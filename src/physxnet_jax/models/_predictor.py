@@ -1,7 +1,7 @@
 """The predictor: a network with its normalisation and atlas."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float
 
 from ..body import Body
 from ..typing import pytree
-from ..uv import Atlas, dress_body
+from ..uv import CONDITIONS, Atlas, dress_body
 from ._features import Family, FeatureConfig, clip_features
-from ._networks import Generator
+from ._networks import Generator, Modulation
 
 # Largest plausible length of a normalised vector. In training, a component exceeds 1 at 0.1 % of
 # texels. Positions are in metres.
@@ -28,11 +28,13 @@ class ModelConfig:
 
     Attributes:
         inputs: Features of the motion, and the frame of the predicted offsets.
-        resolution: Texels per side, a multiple of 16.
+        resolution: Texels per side of the maps of offsets; those of motion are a multiple of 16.
         width: Channels of the first layer.
         templates: Templates with a decoder.
         skirt_chart: Whether the maps have a chart for skirts, see `make_atlas`. Maps that have one
             are sampled as they are; others are smoothed over the cloth.
+        finer: Whether the maps of offsets have twice the resolution of the maps of motion.
+        conditions: Whether the network sees the garment, see `condition_maps`.
     """
 
     inputs: FeatureConfig = dataclasses.field(default_factory=FeatureConfig)
@@ -40,15 +42,24 @@ class ModelConfig:
     width: int = 32
     templates: tuple[str, ...] = ("top", "bottom", "dress")
     skirt_chart: bool = False
+    finer: bool = False
+    conditions: bool = False
 
     def __post_init__(self) -> None:
         if self.skirt_chart and self.family == "paper":
             raise ValueError("skirt_chart is for the family local; the paper's maps have none.")
+        if (self.finer or self.conditions) and not self.skirt_chart:
+            raise ValueError("finer and conditions need skirt_chart.")
 
     @property
     def family(self) -> Family:
         """``paper`` (world frame) or ``local`` (each texel's own frame)."""
         return self.inputs.family
+
+    @property
+    def motion_resolution(self) -> int:
+        """Texels per side of the maps of motion."""
+        return self.resolution // 2 if self.finer else self.resolution
 
 
 @pytree
@@ -73,28 +84,28 @@ class TexelPoints:
     """The texels of an atlas as points on a body shape.
 
     Attributes:
-        rest: Texel points at rest [m], shape [texels, 3].
+        rest: Points of the texels of motion at rest [m], shape [texels, 3].
         rest_dress: The same on the body with joined legs, see `dress_body`.
         weights: Skinning weights, shape [texels, joints].
-        valid: Texels that each template covers, shape [texels].
+        valid: Texels of offsets that each template covers, shape [texels].
     """
 
     rest: Float[Array, "texels 3"]
     rest_dress: Float[Array, "texels 3"]
     weights: Float[Array, "texels joints"]
-    valid: dict[str, Bool[Array, " texels"]]
+    valid: dict[str, Bool[Array, " covered"]]
 
 
 def make_texel_points(
     atlas: Atlas,
     body: Body,
     rest: Float[Array, "all 3"],
-    valid: dict[str, Bool[Array, " texels"]],
+    valid: dict[str, Bool[Array, " covered"]],
 ) -> TexelPoints:
     """The texels of an atlas on a body shape.
 
     Args:
-        atlas: The atlas.
+        atlas: The atlas of the maps of motion.
         body: The body.
         rest: Its rest vertices [m].
         valid: Texels that each template covers.
@@ -111,7 +122,7 @@ class Predictor:
     """A trained network with everything needed for prediction.
 
     Attributes:
-        atlas: The atlas that the maps are defined on.
+        atlas: The atlas of the maps of offsets.
         texel_points: Its texels on a body.
         normalisation: Scales of inputs and outputs.
         state: Parameters and statistics of the network.
@@ -119,6 +130,7 @@ class Predictor:
         config: Configuration of the network.
         mirror_tta: Whether to average with the prediction for the mirrored pose, see
             `with_mirror_tta`.
+        finer_than: The atlas of the maps of motion, if it is another one.
     """
 
     atlas: Atlas
@@ -128,6 +140,19 @@ class Predictor:
     graph: nnx.GraphDef = dataclasses.field(metadata={"static": True})
     config: ModelConfig = dataclasses.field(metadata={"static": True})
     mirror_tta: bool = dataclasses.field(default=False, metadata={"static": True})
+    finer_than: Atlas | None = None
+
+    @property
+    def motion_atlas(self) -> Atlas:
+        """The atlas of the maps of motion."""
+        return self.atlas if self.finer_than is None else self.finer_than
+
+    def modulation(
+        self, template: str, conditions: Float[Array, "height width channels"]
+    ) -> Modulation:
+        """What the maps of a garment change in its decoder, see `condition_maps`."""
+        network = nnx.merge(self.graph, self.state)
+        return network.modulation(template, conditions[None])
 
     def __call__(
         self,
@@ -135,6 +160,7 @@ class Predictor:
         translations: Float[Array, "padded joints 3"],
         fps: float,
         templates: Sequence[str],
+        modulation: Mapping[str, Modulation] | None = None,
     ) -> dict[str, Float[Array, "frames texels 3"]]:
         """Offsets [m] of successive frames.
 
@@ -148,6 +174,8 @@ class Predictor:
             translations: World translations of joints [m], likewise.
             fps: Frames per second.
             templates: Templates whose maps to predict.
+            modulation: Of the garment of each template, see `modulation`. Without it a garment of
+                cotton without ease is assumed.
 
         Returns:
             Offsets of covered texels; zero where the template doesn't cover them.
@@ -161,20 +189,30 @@ class Predictor:
             self.config.inputs,
         )
         features = normalise(features, self.normalisation, self.config.inputs)
-        return self.from_features(features, templates)
+        return self.from_features(features, templates, modulation)
 
     def from_features(
-        self, features: Float[Array, "batch texels channels"], templates: Sequence[str]
-    ) -> dict[str, Float[Array, "batch texels 3"]]:
+        self,
+        features: Float[Array, "batch texels channels"],
+        templates: Sequence[str],
+        modulation: Mapping[str, Modulation] | None = None,
+    ) -> dict[str, Float[Array, "batch covered 3"]]:
         """Offsets [m] from normalised features, see `normalise`."""
         network = nnx.merge(self.graph, self.state)
         network.eval()
         # All parameters have one type: float32, or that set by `at_precision`.
         dtype = jax.tree.leaves(self.state)[0].dtype
-        maps = self.atlas.to_map(features).astype(dtype)
-        if self.mirror_tta:
-            maps = jnp.concatenate([maps, _mirror_maps(maps)])
-        out = network(maps, tuple(templates))
+        maps = self.motion_atlas.to_map(features).astype(dtype)
+        if modulation is None:
+            if self.mirror_tta:
+                maps = jnp.concatenate([maps, _mirror_maps(maps)])
+            out = network(maps, tuple(templates))
+        else:
+            out = network(maps, tuple(templates), modulation)
+            if self.mirror_tta:
+                flipped = jax.tree.map(lambda m: m[:, :, ::-1], modulation)
+                twin = network(_mirror_maps(maps), tuple(templates), flipped)
+                out = {t: jnp.concatenate([m, twin[t]]) for t, m in out.items()}
         return {
             t: jnp.where(
                 self.texel_points.valid[t][None, :, None],
@@ -223,7 +261,7 @@ def with_mirror_tta(predictor: Predictor) -> Predictor:
     Raises:
         ValueError: The halves of the atlas aren't mirror images.
     """
-    atlas = predictor.atlas
+    atlas = predictor.motion_atlas
     positions = np.asarray(atlas.to_map(predictor.texel_points.rest))
     twins = positions[:, ::-1] * np.array([-1.0, 1.0, 1.0])
     mask = np.asarray(atlas.mask)
@@ -274,5 +312,7 @@ def make_generator(config: ModelConfig, *, seed: int = 0) -> Generator:
         config.inputs.channels,
         config.templates,
         width=config.width,
+        finer=config.finer,
+        conditions=len(CONDITIONS) if config.conditions else 0,
         rngs=nnx.Rngs(seed),
     )

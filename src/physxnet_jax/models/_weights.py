@@ -254,6 +254,7 @@ def _filled(
 ) -> Predictor:
     """Fills a network's structure with the tensors of its file."""
     atlas = make_atlas(model.resolution, skirt=model.skirt_chart)
+    coarse = make_atlas(model.motion_resolution, skirt=True) if model.finer else None
     if atlas.digest() != card["atlas"]:
         raise WeightsError(
             f"{weights}: trained on atlas {card['atlas']}, this version makes"
@@ -284,8 +285,9 @@ def _filled(
         {t: jnp.float32(v) for t, v in n["offset"].items()},
     )
     body = load_body()
-    texel_points = make_texel_points(atlas, body, body.rest_vertices(body.default_shape()), valid)
-    return Predictor(atlas, texel_points, normalisation, state, graph, model)
+    rest = body.rest_vertices(body.default_shape())
+    texel_points = make_texel_points(coarse or atlas, body, rest, valid)
+    return Predictor(atlas, texel_points, normalisation, state, graph, model, finer_than=coarse)
 
 
 def _parameters(state: Any) -> list[str]:

@@ -92,6 +92,11 @@ class TrainConfig:
             raise ValueError(f"edge_share is {self.edge_share}; it must be from 0 to 1.")
         if self.edge_share and not self.vertex_share:
             raise ValueError("edge_share is a share of vertex_share, which is 0.")
+        if self.model.conditions and (self.adversarial or self.edge_share):
+            raise ValueError(
+                "conditions: every sample has a garment of its own, whose vertices alone are"
+                " compared; set adversarial = false and leave out edge_share."
+            )
         if self.pyramid_levels > 1 and self.loss == "l2":
             raise ValueError(
                 "pyramid_levels above 1 needs loss='l1', but loss is 'l2'; choose one."

@@ -23,6 +23,7 @@ from ..data import (
     Sequence,
     Where,
     load_frames,
+    make_wardrobe,
     mirrored_sequence,
     read_entry,
     take,
@@ -30,7 +31,6 @@ from ..data import (
 from ..devices import at_home, make_mesh, own_rows, repeated, split
 from ..errors import FormatError, PhysXNetError
 from ..files import append_line, atomic_write
-from ..garment import template
 from ..models import (
     Normalisation,
     Predictor,
@@ -39,6 +39,12 @@ from ..models import (
 from ..uv import Atlas
 from ._checkpoint import Checkpoints, config_json
 from ._config import TrainConfig
+from ._garment_tables import (
+    GarmentTables,
+    Persons,
+    measure_garment_normalisation,
+    prepare_garments,
+)
 from ._monitor import METRICS, EarlyStopping, GanMonitor, TensorBoardLogger, read_metrics
 from ._problem import Loss, Problem, TrainState, make_problem
 from ._step import eval_step, train_step
@@ -94,6 +100,8 @@ def train(
         data.texel_points,
         data.normalisation,
         data.tables,
+        persons=data.persons,
+        motion_atlas=data.motion_atlas,
         fps=data.frames.fps,
         steps=total,
         network=network,
@@ -117,27 +125,28 @@ class _Data:
     unseen: Frames | None
     atlas: Atlas
     texel_points: TexelPoints
-    tables: dict[str, ClothTables]
+    tables: dict[str, ClothTables] | dict[str, GarmentTables]
+    persons: Persons | None
+    motion_atlas: Atlas
     normalisation: Normalisation
 
 
 def _load_data(config: TrainConfig, sequences: Items[Sequence | Where | Entry]) -> _Data:
-    body = load_body()
-    rest = body.rest_vertices(body.default_shape())
-    garments = {t: template(t) for t in config.model.templates}  # pyright: ignore[reportArgumentType]
-    atlas, texel_points, tables = prepare_targets(config.model)
+    body, model = load_body(), config.model
     entries = [read_entry(s) for s in sequences]
+    wardrobe = make_wardrobe([e.outfit for e in entries], model.templates)
+    if not model.conditions and any(wardrobe.outfits):
+        raise FormatError("these data hold outfits; learn from them with conditions = true.")
     held = [e.read() for e in _held_out(config, entries)]
     used = [e for e in entries if e.action not in config.validation]
     if config.mirror_augmentation:
         used += [dataclasses.replace(e, mirrored=True) for e in used]
     load = functools.partial(
         load_frames,
-        garments=garments,
+        wardrobe=wardrobe,
         body=body,
-        rest=rest,
-        window=config.model.inputs.window,
-        local=config.model.family == "local",
+        window=model.inputs.window,
+        local=model.family == "local",
     )
     frames = FrameStream(
         used,
@@ -152,15 +161,29 @@ def _load_data(config: TrainConfig, sequences: Items[Sequence | Where | Entry]) 
         raise FormatError(
             f"no usable cloth in {', '.join(config.validation)}: validate on another action."
         )
+    first = frames.first()
+    if model.conditions:
+        atlas, motion_atlas, points, persons, garments = prepare_garments(model, wardrobe)
+        return _Data(
+            frames=frames,
+            unseen=unseen,
+            atlas=atlas,
+            texel_points=points,
+            tables=garments,
+            persons=persons,
+            motion_atlas=motion_atlas,
+            normalisation=measure_garment_normalisation(first, points, garments, seed=config.seed),
+        )
+    atlas, points, tables = prepare_targets(model)
     return _Data(
         frames=frames,
         unseen=unseen,
         atlas=atlas,
-        texel_points=texel_points,
+        texel_points=points,
         tables=tables,
-        normalisation=measure_normalisation(
-            frames.first(), texel_points, tables, config.model.family, seed=config.seed
-        ),
+        persons=None,
+        motion_atlas=atlas,
+        normalisation=measure_normalisation(first, points, tables, model.family, seed=config.seed),
     )
 
 
@@ -371,4 +394,5 @@ def make_predictor(problem: Problem, state: TrainState) -> Predictor:
         values,
         graph,
         problem.config.model,
+        finer_than=problem.motion_atlas if problem.config.model.finer else None,
     )

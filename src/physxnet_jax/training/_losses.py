@@ -148,6 +148,29 @@ def vertex_loss(
     return (1.0 - edge_share) * value + edge_share * along
 
 
+def vertex_distance(
+    predicted: Float[Array, "batch vertices 3"],
+    target: Float[Array, "batch vertices 3"],
+    weight: Float[Array, "batch vertices"],
+    *,
+    squared: bool = False,
+) -> Float[Array, ""]:
+    """Mean absolute (or squared) error of offsets at vertices.
+
+    Args:
+        predicted: Normalised offsets.
+        target: Normalised offsets.
+        weight: Weight of each vertex; 0 for padding.
+        squared: Squared errors.
+
+    Returns:
+        The mean; zero if nothing counts.
+    """
+    gap = predicted - target
+    error = jnp.mean(jnp.square(gap) if squared else jnp.abs(gap), axis=2)
+    return jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1.0)
+
+
 def _masked_mean(
     error: Float[Array, "batch texels 3"],
     valid: Bool[Array, " texels"],

@@ -18,10 +18,12 @@ from ..models import (
 from ..typing import pytree
 from ..uv import Atlas
 from ._config import TrainConfig
+from ._garment_tables import GarmentTables, Persons
 from ._losses import (
     masked_l1,
     masked_l2,
     pooled_l1,
+    vertex_distance,
     vertex_loss,
 )
 from ._optimizer import make_optimizer
@@ -60,24 +62,28 @@ class LossInputs:
     Attributes:
         maps: Predicted maps, shape [batch, height, width, 3].
         texels: The same at covered texels, shape [batch, texels, 3].
-        target: Targets at texels, shape [batch, texels, 3].
+        target: Targets at texels, shape [batch, texels, 3]; None where every sample has a garment
+            of its own.
         valid: Texels that the template covers, shape [texels].
         weight: Weight of each sample, shape [batch].
         vertices: Predictions sampled at the garment's vertices as in `dress_frames`, shape
             [batch, vertices, 3].
         vertex_target: Targets there, shape [batch, vertices, 3].
-        edges: Vertices of the garment's edges, shape [edges, 2].
+        present: 1 for vertices, 0 for padding, shape [batch, vertices].
+        edges: Vertices of the garment's edges, shape [edges, 2]; None where every sample has a
+            garment of its own.
         atlas: The atlas of the maps.
     """
 
     maps: Float[Array, "batch height width 3"]
     texels: Float[Array, "batch texels 3"]
-    target: Float[Array, "batch texels 3"]
+    target: Float[Array, "batch texels 3"] | None
     valid: Bool[Array, " texels"]
     weight: Float[Array, " batch"]
     vertices: Float[Array, "batch vertices 3"]
     vertex_target: Float[Array, "batch vertices 3"]
-    edges: Array
+    present: Float[Array, "batch vertices"]
+    edges: Array | None
     atlas: Atlas
 
 
@@ -95,6 +101,8 @@ class Problem:
         texel_points: Its texels on the body.
         normalisation: Scales of inputs and outputs.
         tables: What turns a template's stored offsets into targets.
+        persons: Bodies, for a network that sees garments.
+        motion_atlas: The atlas of the maps of motion.
         config: Settings of the run.
         fps: Frames a second.
         loss: The loss of one template.
@@ -107,7 +115,9 @@ class Problem:
     atlas: Atlas
     texel_points: TexelPoints
     normalisation: Normalisation
-    tables: dict[str, ClothTables]
+    tables: dict[str, ClothTables] | dict[str, GarmentTables]
+    persons: Persons | None
+    motion_atlas: Atlas
     config: TrainConfig = dataclasses.field(metadata={"static": True})
     fps: float = dataclasses.field(metadata={"static": True})
     loss: Loss = dataclasses.field(metadata={"static": True})
@@ -128,6 +138,13 @@ def configured_loss(config: TrainConfig) -> Loss:
     distance = masked_l2 if config.loss == "l2" else masked_l1
 
     def loss(x: LossInputs) -> Float[Array, ""]:
+        if x.target is None or x.edges is None:
+            return vertex_distance(
+                x.vertices,
+                x.vertex_target,
+                x.present * x.weight[:, None],
+                squared=config.loss == "l2",
+            )
         if config.pyramid_levels == 1:
             at_texels = distance(x.texels, x.target, x.valid, x.weight)
         else:
@@ -150,8 +167,10 @@ def make_problem(
     atlas: Atlas,
     texel_points: TexelPoints,
     normalisation: Normalisation,
-    tables: dict[str, ClothTables],
+    tables: dict[str, ClothTables] | dict[str, GarmentTables],
     *,
+    persons: Persons | None = None,
+    motion_atlas: Atlas | None = None,
     fps: float,
     steps: int,
     network: nnx.Module | None = None,
@@ -166,6 +185,8 @@ def make_problem(
         texel_points: Its texels on the body.
         normalisation: Scales of inputs and outputs.
         tables: For each template, what turns stored offsets into targets.
+        persons: Bodies, for a network that sees garments.
+        motion_atlas: The atlas of the maps of motion; ``atlas`` if None.
         fps: Frames a second.
         steps: Length of the run in steps.
         network: Any module with the signature of `Generator`; a `Generator` by default.
@@ -195,6 +216,8 @@ def make_problem(
         texel_points=texel_points,
         normalisation=normalisation,
         tables=tables,
+        persons=persons,
+        motion_atlas=atlas if motion_atlas is None else motion_atlas,
         config=config,
         fps=fps,
         loss=configured_loss(config) if loss is None else loss,

@@ -1,6 +1,7 @@
 """One training step: generator, then discriminator on the same maps, as one jitted function."""
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -11,11 +12,13 @@ from jaxtyping import Array, Float, Key
 
 from ..data import QUANTIZATION_STEP
 from ..models import clip_features, normalise
+from ._garment_tables import GarmentTables
 from ._losses import (
     adversarial_loss,
     discriminator_loss,
     masked_l1,
     soft_labels,
+    vertex_distance,
 )
 from ._problem import LossInputs, Problem, TrainState
 from ._targets import target_offsets
@@ -27,20 +30,27 @@ def _prepare(problem: Problem, batch: Batch) -> tuple[Array, dict[str, Array], d
     """Motion maps, normalised targets at texels, and masks of the texels that count."""
     config, points = problem.config, problem.texel_points
     inputs = config.model.inputs
-    features = jax.vmap(clip_features, in_axes=(None, None, 0, 0, None, None))(
-        points.rest,
+    persons = problem.persons
+    rest = points.rest[None] if persons is None else persons.rest[batch["person"]]
+    rest = jnp.broadcast_to(rest, (len(batch["rotations"]), *rest.shape[1:]))
+    features = jax.vmap(clip_features, in_axes=(0, None, 0, 0, None, None))(
+        rest,
         points.weights,
         batch["rotations"],
         batch["translations"],
         problem.fps,
         inputs,
     )
-    x = problem.atlas.to_map(normalise(features[:, 0], problem.normalisation, inputs))
+    x = problem.motion_atlas.to_map(normalise(features[:, 0], problem.normalisation, inputs))
     targets, masks = {}, {}
     for t in config.model.templates:
+        table = problem.tables[t]
+        # Where every sample has a garment of its own, vertices alone are compared.
+        if isinstance(table, GarmentTables):
+            continue
         meters = target_offsets(
             batch[f"target_{t}"],
-            problem.tables[t],
+            table,
             points,
             batch["rotations"][:, -1],
             batch["translations"][:, -1],
@@ -57,22 +67,41 @@ def _loss_inputs(
 ) -> LossInputs:
     valid, table = problem.texel_points.valid[t], problem.tables[t]
     texels = problem.atlas.from_map(maps)
+    seen = jnp.where(valid[None, :, None], texels, 0.0)
     stored = batch[f"target_{t}"].astype(jnp.float32) * QUANTIZATION_STEP
+    if isinstance(table, GarmentTables):
+        garment = batch[f"garment_{t}"]
+        vertices, present, edges = table.sample(seen, garment), table.present[garment], None
+    else:
+        vertices, edges = table.bound.sample(seen), table.edges
+        present = jnp.ones(vertices.shape[:2], jnp.float32)
     return LossInputs(
         maps=maps,
         texels=texels,
-        target=targets[t],
+        target=targets.get(t),
         valid=valid,
         weight=batch[f"weight_{t}"],
-        vertices=table.bound.sample(jnp.where(valid[None, :, None], texels, 0.0)),
+        vertices=vertices,
         vertex_target=stored / problem.normalisation.offset[t],
-        edges=table.edges,
+        present=present,
+        edges=edges,
         atlas=problem.atlas,
     )
 
 
+def _modulation(problem: Problem, network: Any, batch: Batch, dtype: Any) -> dict[str, Any]:
+    """What each sample's garments change in their decoders."""
+    out = {}
+    for t in problem.config.model.templates:
+        conditions = problem.tables[t].conditions[batch[f"garment_{t}"]]  # pyright: ignore
+        out[t] = network.modulation(t, conditions.astype(dtype))
+    return out
+
+
 def _mean_error(x: LossInputs) -> Float[Array, ""]:
-    """L1 at texels relative to their scale: reported whatever is minimised."""
+    """L1 relative to the scale, at texels or else at vertices: reported whatever is minimised."""
+    if x.target is None:
+        return vertex_distance(x.vertices, x.vertex_target, x.present * x.weight[:, None])
     return masked_l1(x.texels, x.target, x.valid, x.weight)
 
 
@@ -97,20 +126,14 @@ def eval_step(
     """
     config = problem.config
     x, targets, masks = _prepare(problem, batch)
-    maps, _ = _apply_network(
-        problem.generator,
-        state.generator,
-        state.generator_rest,
-        x,
-        config.model.templates,
-        dtype=jnp.dtype(config.precision),
-        train=False,
-    )
+    maps, _ = _apply_generator(problem, state.generator, state, x, batch, train=False)
     losses, shown = {}, {}
     for t in config.model.templates:
         scale = problem.normalisation.offset[t]
         found = _loss_inputs(problem, t, maps[t], targets, batch)
         losses[t] = 1e3 * scale * _mean_error(found)
+        if not targets:
+            continue
         wanted = problem.atlas.to_map(targets[t])
         shown[t] = (maps[t] * masks[t] * scale, wanted * masks[t] * scale)
     return losses, shown
@@ -139,15 +162,13 @@ def train_step(
     x, targets, masks = _prepare(problem, batch)
 
     def generator_loss(params: Any) -> tuple[Array, tuple]:
-        maps, rest = _apply_network(
-            problem.generator, params, state.generator_rest, x, templates, dtype=dtype
-        )
+        maps, rest = _apply_generator(problem, params, state, x, batch)
         total, parts = jnp.zeros(()), {}
         for t in templates:
             found = _loss_inputs(problem, t, maps[t], targets, batch)
             parts[t] = _mean_error(found)
             total = total + problem.loss(found) / len(templates)
-        fake = _stack(problem, maps, masks)
+        fake = _stack(problem, maps, masks) if config.adversarial else jnp.zeros(())
         adv = jnp.zeros(())
         if config.adversarial:
             judged = (state.discriminator, state.discriminator_rest)
@@ -223,7 +244,13 @@ def _discriminator_step(
 
 
 def _apply_network(
-    graph: Any, params: Any, rest: Any, *inputs: Any, dtype: Any, train: bool = True
+    graph: Any,
+    params: Any,
+    rest: Any,
+    *inputs: Any,
+    dtype: Any,
+    train: bool = True,
+    call: Callable[..., Any] | None = None,
 ) -> tuple[Any, Any]:
     """Output of a network computed in ``dtype``, and its updated statistics."""
     lowered = jax.tree.map(lambda v: v.astype(dtype), params)
@@ -234,9 +261,34 @@ def _apply_network(
         network.eval()
     # Batch statistics stay float32, whatever the network computes in.
     with jax.numpy_dtype_promotion("standard"):
-        out = network(*(x.astype(dtype) if isinstance(x, jax.Array) else x for x in inputs))
+        given = (x.astype(dtype) if isinstance(x, jax.Array) else x for x in inputs)
+        out = network(*given) if call is None else call(network, *given)
     answers = jax.tree.map(lambda m: m.astype(jnp.float32), out)
     return answers, nnx.state(network, nnx.Not(nnx.Param))
+
+
+def _apply_generator(
+    problem: Problem,
+    params: Any,
+    state: TrainState,
+    x: Array,
+    batch: Batch,
+    *,
+    train: bool = True,
+) -> tuple[Any, Any]:
+    """The generator's maps, and its updated statistics."""
+    config = problem.config
+    dtype = jnp.dtype(config.precision)
+
+    def call(network: Any, maps: Array) -> Any:
+        if not config.model.conditions:
+            return network(maps, config.model.templates)
+        known = _modulation(problem, network, batch, dtype)
+        return network(maps, config.model.templates, known)
+
+    return _apply_network(
+        problem.generator, params, state.generator_rest, x, dtype=dtype, train=train, call=call
+    )
 
 
 def _where_finite(finite: Array, new: Any, old: Any) -> Any:

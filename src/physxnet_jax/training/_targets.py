@@ -120,6 +120,28 @@ def measure_normalisation(
         A percentile instead of the largest value: one fast hand in one frame would
         otherwise squeeze all other motion into a few per cent of the range.
     """
+    velocity, acceleration = motion_scales(frames, texel_points, samples=samples, seed=seed)
+    # Its own generator: the samples of maps and of targets are independent.
+    rng = np.random.default_rng(seed)
+    return Normalisation(
+        velocity,
+        acceleration,
+        {
+            t: scale_of(np.abs(_sample_targets(frames, texel_points, t, table, family, rng)))
+            for t, table in tables.items()
+        },
+    )
+
+
+def scale_of(values: np.ndarray) -> Array:
+    """What 99.9 % of values don't exceed."""
+    return jnp.asarray(max(float(np.quantile(values, 0.999)), 1e-6), jnp.float32)
+
+
+def motion_scales(
+    frames: Frames, texel_points: TexelPoints, *, samples: int, seed: int
+) -> tuple[Array, Array]:
+    """Scales of velocities [m/s] and accelerations [m/s^2] in a sample of frames."""
     pick = np.random.default_rng(seed).choice(len(frames), min(samples, len(frames)), False)
     features_of = jax.jit(clip_features, static_argnames=("fps", "inputs"))
     # World axes, whatever frame the network uses: close enough for a scale.
@@ -138,20 +160,7 @@ def measure_normalisation(
         for i in pick
     ]
     features = np.stack(rows)
-    # Its own generator: the samples of maps and of targets are independent.
-    rng = np.random.default_rng(seed)
-
-    def scale(x: np.ndarray) -> Array:
-        return jnp.asarray(max(float(np.quantile(x, 0.999)), 1e-6), jnp.float32)
-
-    return Normalisation(
-        scale(features[..., :3]),
-        scale(features[..., 3:6]),
-        {
-            t: scale(np.abs(_sample_targets(frames, texel_points, t, table, family, rng)))
-            for t, table in tables.items()
-        },
-    )
+    return scale_of(features[..., :3]), scale_of(features[..., 3:6])
 
 
 def _sample_targets(

@@ -12,19 +12,23 @@ from ..models import Predictor, clip_features
 
 
 def texel_picture(
-    values: Float[np.ndarray, "texels 3"], texels: Int[np.ndarray, " texels"], resolution: int
+    values: Float[np.ndarray, "texels 3"],
+    texels: Int[np.ndarray, " texels"],
+    height: int,
+    width: int,
 ) -> UInt8[np.ndarray, "height width 3"]:
     """A map of three channels as a picture: zero is grey, empty texels are white.
 
     Args:
         values: Its covered texels.
         texels: Their indices, row by row.
-        resolution: Texels per side.
+        height: Rows of the map.
+        width: Columns of the map.
     """
     scale = max(float(np.quantile(np.abs(values), 0.98)), 1e-9)
-    flat = np.full((resolution * resolution, 3), 255, np.uint8)
+    flat = np.full((height * width, 3), 255, np.uint8)
     flat[texels] = (127 + 120 * np.clip(values / scale, -1, 1)).astype(np.uint8)
-    return flat.reshape(resolution, resolution, 3)
+    return flat.reshape(height, width, 3)
 
 
 def frame_maps(
@@ -48,17 +52,19 @@ def frame_maps(
     """
     inputs = predictor.config.inputs
     features, offset_maps = _maps(predictor, world, shift, fps, tuple(dict.fromkeys(templates)))
-    texels = np.asarray(predictor.atlas.texels)
+    atlas, motion_atlas = predictor.atlas, predictor.motion_atlas
     out, start = {}, 0
     for kind in inputs.kinds:
         width = inputs.width(kind)
         if kind in ("velocity", "acceleration"):
             # The last of the window's frames is the one shown.
             last = np.asarray(features)[:, start + width - 3 : start + width]
-            out[kind] = texel_picture(last, texels, predictor.config.resolution)
+            texels = np.asarray(motion_atlas.texels)
+            out[kind] = texel_picture(last, texels, motion_atlas.height, motion_atlas.width)
         start += width
     for name, offsets in offset_maps.items():
-        out[name] = texel_picture(np.asarray(offsets), texels, predictor.config.resolution)
+        texels = np.asarray(atlas.texels)
+        out[name] = texel_picture(np.asarray(offsets), texels, atlas.height, atlas.width)
     return out
 
 
@@ -75,7 +81,8 @@ def _maps(
 
 def magnified(
     picture: UInt8[np.ndarray, "height width 3"], size: int
-) -> UInt8[np.ndarray, "size size 3"]:
-    """Resizes a picture with nearest-neighbour sampling, so that texels stay squares."""
-    pick = np.arange(size) * len(picture) // size
-    return picture[pick][:, pick]
+) -> UInt8[np.ndarray, "rows size 3"]:
+    """Resizes a picture to a width with nearest-neighbour sampling, so that texels stay squares."""
+    height, width, _ = picture.shape
+    rows = np.arange(size * height // width) * width // size
+    return picture[rows][:, np.arange(size) * width // size]
