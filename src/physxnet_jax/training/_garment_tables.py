@@ -78,7 +78,7 @@ def prepare_garments(
     every = jnp.ones(atlas.num_texels, bool)
     tables, valid = {}, {}
     for name in model.templates:
-        garments = wardrobe.garments[name]
+        garments = wardrobe.garments.get(name, ())
         if not garments:
             raise FormatError(f"no '{name}' in the data: simulate one, or drop the template.")
         bound = [bind(g, atlas=atlas, body=body, rest=rest, valid=every) for g in garments]

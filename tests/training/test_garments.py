@@ -1,0 +1,123 @@
+"""Networks that see the garment: they learn what depends on it."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.data import Outfit, Sequence, make_wardrobe
+from physxnet_jax.dressing import Inference, clothe, clothe_step, init_stream, make_dresser
+from physxnet_jax.errors import FormatError
+from physxnet_jax.garment import tailor
+from physxnet_jax.models import ModelConfig, load_predictor, save_predictor
+from physxnet_jax.motion import load_motion
+from physxnet_jax.training import TrainConfig, train
+from physxnet_jax.training._garment_tables import prepare_garments
+from physxnet_jax.uv import bind
+
+MODEL = ModelConfig(
+    resolution=64, width=4, templates=("top",), skirt_chart=True, finer=True, conditions=True
+)
+CONFIG = TrainConfig(
+    model=MODEL, batch=8, epochs=30, learning_rate=1e-2, schedule="cosine", adversarial=False
+)
+TIGHT = Outfit(wear=("tee:ease=0.05",))
+LOOSE = Outfit(wear=("loose:ease=0.3",), shape=("weight_up=0.5",))
+# How far the cloth of these tests stands off where it is loose [m].
+OFF = 0.04
+
+
+def sequence(outfit, far):
+    motion = load_motion("walk", fps=30.0)
+    motion = dataclasses.replace(motion, rotations=motion.rotations[:24], root=motion.root[:24])
+    (garment,) = outfit.garments().values()
+    offsets = np.zeros((24, garment.num_vertices, 3), np.float32)
+    offsets[..., 1] = far
+    meta = {"top": {"engine": "physxnet", "finite": True, "worst": {}}}
+    return Sequence(f"walk {far}", "train", motion, {"top": offsets}, meta, outfit)
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory):
+    """A network that saw tight cloth on its skinning and loose cloth below it."""
+    folder = tmp_path_factory.mktemp("run")
+    return train(CONFIG, [sequence(TIGHT, 0.0), sequence(LOOSE, -OFF)], folder)
+
+
+def test_garments_and_persons_are_numbered_once():
+    w = make_wardrobe([TIGHT, LOOSE, TIGHT, dataclasses.replace(TIGHT)], ("top", "bottom"))
+    assert len(w.garments["top"]) == 2 and w.garments["bottom"] == ()
+    assert [w.numbers["top", o] for o in (TIGHT, LOOSE)] == [0, 1]
+    assert w.persons == ((), ("weight_up=0.5",)) and w.person(LOOSE) == 1
+    assert w.num_vertices("top") == max(g.num_vertices for g in w.garments["top"])
+    assert len(w.rests()) == 2
+
+
+def test_tables_sample_as_bindings_do():
+    wardrobe = make_wardrobe([TIGHT, LOOSE], ("top",))
+    atlas, motion_atlas, points, persons, tables = prepare_garments(MODEL, wardrobe)
+    assert (atlas.height, motion_atlas.height) == (96, 48)
+    assert persons.rest.shape == (2, motion_atlas.num_texels, 3)
+    assert float(jnp.abs(persons.rest[0] - points.rest).max()) == 0.0
+    values = jax.random.normal(jax.random.key(0), (2, atlas.num_texels, 3))
+    got = tables["top"].sample(values, jnp.asarray([0, 1]))
+    for k, garment in enumerate(wardrobe.garments["top"]):
+        binding = bind(garment, atlas=atlas, valid=jnp.ones(atlas.num_texels, bool))
+        n = garment.num_vertices
+        np.testing.assert_allclose(got[k, :n], binding.sample(values[k][None])[0], atol=1e-5)
+        assert float(tables["top"].present[k].sum()) == n
+    with pytest.raises(FormatError, match="no 'bottom' in the data"):
+        prepare_garments(dataclasses.replace(MODEL, templates=("bottom",)), wardrobe)
+
+
+@pytest.mark.parametrize("wrong", [{"adversarial": True}, {"vertex_share": 1.0, "edge_share": 0.5}])
+def test_what_needs_one_garment_is_refused(wrong):
+    with pytest.raises(ValueError, match="a garment of its own"):
+        dataclasses.replace(CONFIG, **wrong)
+
+
+def test_a_network_that_cannot_see_garments_refuses_outfits(tmp_path):
+    blind = dataclasses.replace(
+        CONFIG, model=ModelConfig(resolution=32, width=4, templates=("top",))
+    )
+    with pytest.raises(FormatError, match="conditions = true"):
+        train(blind, [sequence(TIGHT, 0.0)], tmp_path)
+
+
+@pytest.mark.release
+def test_what_depends_on_the_garment_is_learned(learned, body):
+    """Whoever sees the motion alone is half of the difference wrong on both."""
+    fallen = {}
+    for outfit in (TIGHT, LOOSE):
+        (garment,) = outfit.garments().values()
+        inference = Inference(weights=learned, strain_iterations=0, collisions=False)
+        dresser = make_dresser([garment], shape=outfit.params(), inference=inference)
+        motion = load_motion("walk", fps=30.0)
+        cloth = clothe(dresser, motion.rotations[4:12], motion.root[4:12], 30.0)[garment.name]
+        bare = make_dresser([garment], method="lbs", shape=outfit.params())
+        skinned = clothe(bare, motion.rotations[4:12], motion.root[4:12], 30.0)[garment.name]
+        fallen[outfit] = float(jnp.mean(cloth[..., 1] - skinned[..., 1]))
+    assert abs(fallen[TIGHT]) < 0.3 * OFF
+    assert fallen[LOOSE] == pytest.approx(-OFF, abs=0.3 * OFF)
+
+
+@pytest.mark.release
+def test_garments_of_one_template_have_maps_of_their_own(learned, body, tmp_path):
+    save_predictor(tmp_path / "w", learned, name="w")
+    weights = load_predictor(tmp_path / "w")
+    inference = Inference(weights=weights, strain_iterations=0, collisions=False)
+    garments = [tailor("tee", ease=0.05), tailor("loose", ease=0.3)]
+    motion = load_motion("walk", fps=30.0)
+    q, p = motion.rotations[:6], motion.root[:6]
+    both = clothe(make_dresser(garments, inference=inference), q, p, 30.0)
+    for g in garments:
+        alone = clothe(make_dresser([g], inference=inference), q, p, 30.0)
+        np.testing.assert_allclose(both[g.name], alone[g.name], atol=1e-5)
+    dresser = make_dresser(garments, inference=inference)
+    stream = init_stream(dresser, q[:2], p[:2])
+    for k in range(6):
+        stream, now = clothe_step(dresser, stream, q[k], p[k], 30.0)
+        for g in garments:
+            np.testing.assert_allclose(now[g.name], both[g.name][k], atol=1e-4)
