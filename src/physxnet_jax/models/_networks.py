@@ -107,6 +107,8 @@ class Generator(nnx.Module):
         width: Channels of the first layer; doubled at each of four levels.
         finer: Whether offset maps have twice the resolution of motion maps.
         conditions: Channels of maps that describe a garment; 0 for none.
+        skirt: Whether the lowest third of the maps is the chart of skirts: all decoders but that
+            of ``dress`` leave it out.
         rngs: Random streams for the initial parameters.
 
     Example:
@@ -126,8 +128,10 @@ class Generator(nnx.Module):
         width: int = 32,
         finer: bool = False,
         conditions: int = 0,
+        skirt: bool = False,
         rngs: nnx.Rngs,
     ) -> None:
+        self.skirt = skirt
         sizes = [channels, *(width * 2**k for k in range(LEVELS))]
         self.encoder = nnx.List([Down(a, b, rngs=rngs) for a, b in itertools.pairwise(sizes)])
         self.decoders = nnx.Dict(
@@ -141,7 +145,14 @@ class Generator(nnx.Module):
         modulator = self.decoders[template].modulator
         if modulator is None:
             raise ValueError("this network takes no maps of garments.")
-        return modulator(conditions)
+        return modulator(self._used(template, conditions))
+
+    def _used(
+        self, template: str, maps: Float[Array, "batch height width channels"]
+    ) -> Float[Array, "batch h width channels"]:
+        """The rows of maps that a template's decoder needs."""
+        whole = template == "dress" or not self.skirt
+        return maps if whole else maps[:, : maps.shape[1] * 2 // 3]
 
     def __call__(
         self,
@@ -158,19 +169,27 @@ class Generator(nnx.Module):
                 conditions.
 
         Raises:
-            ValueError: A size that isn't a multiple of 16.
+            ValueError: A size that isn't a multiple of 16, or of 48 with the chart of skirts.
         """
-        if x.shape[1] % 2**LEVELS or x.shape[2] % 2**LEVELS:
+        rows = 3 * 2**LEVELS if self.skirt else 2**LEVELS
+        if x.shape[1] % rows or x.shape[2] % 2**LEVELS:
             raise ValueError(
                 f"maps of {x.shape[1]} x {x.shape[2]}: both must be multiples of"
-                f" {2**LEVELS}, because there are {LEVELS} halvings."
+                f" {2**LEVELS}, because there are {LEVELS} halvings"
+                + (", and rows of three times that." if self.skirt else ".")
             )
         features = []
         for layer in self.encoder:
             x = layer(x)
             features.append(x)
-        known = modulation or {}
-        return {t: self.decoders[t](features, known.get(t)) for t in templates}
+        known, out = modulation or {}, {}
+        for t in templates:
+            seen = [self._used(t, f) for f in features]
+            m = self.decoders[t](seen, known.get(t))
+            # Rows of the chart that was left out.
+            missing = m.shape[1] * features[0].shape[1] // seen[0].shape[1] - m.shape[1]
+            out[t] = jnp.pad(m, ((0, 0), (0, missing), (0, 0), (0, 0))) if missing else m
+        return out
 
 
 class Discriminator(nnx.Module):

@@ -314,5 +314,6 @@ def make_generator(config: ModelConfig, *, seed: int = 0) -> Generator:
         width=config.width,
         finer=config.finer,
         conditions=len(CONDITIONS) if config.conditions else 0,
+        skirt=config.skirt_chart,
         rngs=nnx.Rngs(seed),
     )
