@@ -21,7 +21,7 @@ from ..data import (
 from ..errors import FormatError
 from ..evaluation import Finding, check_sequence, method_by_name, skinning
 from ..files import atomic_write, check_writable
-from ..garment import TEMPLATES, Template, template
+from ..garment import TEMPLATES, Template
 from ..io import AnimatedMesh
 from ..motion import Motion
 from ..viewer import render_frame
@@ -132,8 +132,9 @@ def _picture(sequence: Sequence) -> np.ndarray:
     tiles = []
     names: list[Template] = [t for t in TEMPLATES if t in sequence.offsets]
     for name in names:
-        cloth = skinning()(sequence.motion, name).positions + sequence.offsets[name]
-        faces = np.asarray(template(name).mesh.faces)
+        skinned = skinning()(sequence.motion, sequence.clothing(name)).positions
+        cloth = skinned + sequence.offsets[name]
+        faces = np.asarray(sequence.garment(name).mesh.faces)
         mesh = AnimatedMesh(name, cloth[middle : middle + 1], faces)
         tiles.append(render_frame([mesh], 0, size=_TILE))
     return np.concatenate(tiles, axis=1)

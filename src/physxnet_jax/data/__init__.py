@@ -12,7 +12,13 @@ from ._frames import (
     usable_garment as usable_garment,
 )
 from ._mirror import mirrored_offsets as mirrored_offsets, mirrored_sequence as mirrored_sequence
-from ._outfit import Outfit as Outfit
+from ._outfit import (
+    Clothing as Clothing,
+    Outfit as Outfit,
+    Worn as Worn,
+    garment_of as garment_of,
+    shape_of as shape_of,
+)
 from ._protocol import (
     Action as Action,
     left_out as left_out,

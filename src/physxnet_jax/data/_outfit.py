@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..body import load_body
 from ..errors import PhysXNetError
-from ..garment import KINDS, Garment, parse_wear, tailor
+from ..garment import KINDS, Garment, Template, parse_wear, tailor, template
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -71,6 +71,37 @@ def _garments(outfit: Outfit) -> dict[str, Garment]:
                 )
             out[garment.template] = garment
     return out
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Worn:
+    """One garment of an outfit.
+
+    Attributes:
+        outfit: The outfit.
+        template: The garment's template.
+    """
+
+    outfit: Outfit
+    template: str
+
+
+Clothing = Template | Worn
+"""A template on the default shape, or a garment of an outfit."""
+
+
+def garment_of(clothing: Clothing) -> Garment:
+    """The garment itself."""
+    if isinstance(clothing, Worn):
+        return clothing.outfit.garments()[clothing.template]
+    return template(clothing)
+
+
+def shape_of(clothing: Clothing) -> Float[Array, " shapes"]:
+    """Shape parameters of whoever wears it."""
+    if isinstance(clothing, Worn):
+        return clothing.outfit.params()
+    return load_body().default_shape()
 
 
 def read_outfit(found: Any) -> Outfit | None:

@@ -22,11 +22,11 @@ from jaxtyping import Float, Int
 
 from ..errors import FormatError
 from ..files import read_arrays
-from ..garment import Garment, template
+from ..garment import Garment
 from ..motion import Motion, make_motion
 from ._codec import Codec, make_codec
 from ._files import join, last_name, list_files, open_array, read_file, remove_file, write_file
-from ._outfit import Outfit, read_outfit
+from ._outfit import Clothing, Outfit, Worn, garment_of, read_outfit
 
 Where = str | pathlib.Path
 """A path or a URL."""
@@ -65,11 +65,15 @@ class Sequence:
     meta: dict[str, Any]
     outfit: Outfit | None = None
 
+    def clothing(self, name: str) -> Clothing:
+        """What is worn of a template."""
+        if self.outfit is None:
+            return name  # pyright: ignore[reportReturnType]
+        return Worn(outfit=self.outfit, template=name)
+
     def garment(self, name: str) -> Garment:
         """The garment of a template."""
-        if self.outfit is None:
-            return template(name)  # pyright: ignore[reportArgumentType]
-        return self.outfit.garments()[name]
+        return garment_of(self.clothing(name))
 
 
 def open_dataset(root: Where, note: dict[str, Any]) -> None:

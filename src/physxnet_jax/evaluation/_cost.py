@@ -233,8 +233,9 @@ def mean_errors(
         for s in sequences:
             if t not in s.offsets or not usable_garment(s.meta[t]):
                 continue
-            reference = skinning()(s.motion, t).positions + s.offsets[t]
-            found.append(vertex_error(method(s.motion, t).positions, reference).rmse_mm)
+            worn = s.clothing(t)
+            reference = skinning()(s.motion, worn).positions + s.offsets[t]
+            found.append(vertex_error(method(s.motion, worn).positions, reference).rmse_mm)
         if found:
             out[t] = statistics.fmean(found)
     return out

@@ -5,9 +5,9 @@ from typing import SupportsFloat
 import numpy as np
 
 from ..data import Sequence
-from ..garment import TEMPLATES, Template, template
-from ..simulation import OFF, Scene, prepare_scene, slipped
-from ._methods import skinning
+from ..garment import TEMPLATES, Template
+from ..simulation import OFF, prepare_scene, slipped
+from ._methods import scene_of, skinning
 from ._motion_metrics import jitter
 from ._penetration import penetration
 from ._strain import edge_strain
@@ -38,19 +38,19 @@ def check_sequence(sequence: Sequence, frames: int | None = None) -> list[Findin
 
     names: list[Template] = [t for t in TEMPLATES if t in sequence.offsets]
     for name in names:
-        offsets = sequence.offsets[name]
-        motion = sequence.motion
+        offsets, worn = sequence.offsets[name], sequence.clothing(name)
+        motion, count = sequence.motion, sequence.garment(name).num_vertices
         if frames is not None:
             add(name, "frames missing", 0.0, abs(len(offsets) - frames))
         add(name, "not finite", 0.0, 0.0 if sequence.meta[name]["finite"] else 1.0)
-        add(name, "vertices missing", 0.0, abs(offsets.shape[1] - template(name).num_vertices))
-        if offsets.shape[1] != template(name).num_vertices:
+        add(name, "vertices missing", 0.0, abs(offsets.shape[1] - count))
+        if offsets.shape[1] != count:
             continue
         add(name, "frame count difference to motion", 0.0, abs(len(offsets) - motion.num_frames))
         if len(offsets) != motion.num_frames:
             continue
-        scene = prepare_scene(Scene((template(name),)))
-        skinned = skinning()(motion, name).positions
+        scene = prepare_scene(scene_of(worn))
+        skinned = skinning()(motion, worn).positions
         cloth = skinned + offsets
         add(name, "slid along the body, m", OFF, slipped(scene.assembly, motion, cloth).max())
         sampled = np.arange(0, len(cloth), _FRAME_STRIDE)

@@ -10,11 +10,11 @@ import numpy as np
 
 from .._environment import clear_caches_if_full
 from ..body import load_body
-from ..data import Sequence, usable_garment
-from ..garment import Template, template
-from ..simulation import Assembly, Scene, prepare_scene
+from ..data import Clothing, Sequence, garment_of, usable_garment
+from ..garment import Template
+from ..simulation import Assembly, prepare_scene
 from ..uv import Transference, garment_map_rows, make_atlas
-from ._methods import Method, skinning
+from ._methods import Method, scene_of, skinning
 from ._metrics import vertex_error
 from ._motion_metrics import (
     acceleration_error,
@@ -164,7 +164,9 @@ def retime(
             report(f"{row.method}, {row.action}, {row.template}", k, len(rows))
         timed = row.method in methods and row.template in templates
         if timed and row.action in actions:
-            prediction = methods[row.method](actions[row.action].motion, row.template)  # pyright: ignore[reportArgumentType]
+            sequence = actions[row.action]
+            worn = sequence.clothing(row.template)
+            prediction = methods[row.method](sequence.motion, worn)
             row = dataclasses.replace(row, ms_per_frame=prediction.ms_per_frame)
         yield row
 
@@ -173,25 +175,25 @@ class _ReferenceTables:
     """Reference data shared by all methods."""
 
     def __init__(self) -> None:
-        self._tables: dict[Template, tuple[Assembly, Transference]] = {}
+        self._tables: dict[Clothing, tuple[Assembly, Transference]] = {}
 
-    def tables(self, name: Template) -> tuple[Assembly, Transference]:
-        if name not in self._tables:
+    def tables(self, worn: Clothing) -> tuple[Assembly, Transference]:
+        if worn not in self._tables:
             body = load_body()
             rest = body.rest_vertices(body.default_shape())
-            scene = prepare_scene(Scene((template(name),)))
-            to_cloth = garment_map_rows(make_atlas(_RESOLUTION), body, rest, template(name))
-            self._tables[name] = (scene.assembly, to_cloth)
-        return self._tables[name]
+            scene = prepare_scene(scene_of(worn))
+            to_cloth = garment_map_rows(make_atlas(_RESOLUTION), body, rest, garment_of(worn))
+            self._tables[worn] = (scene.assembly, to_cloth)
+        return self._tables[worn]
 
     def measure(
         self, label: str, method: Method, sequence: Sequence, name: Template
     ) -> ActionError:
-        assembly, to_cloth = self.tables(name)
-        motion = sequence.motion
-        reference = skinning()(motion, name).positions + sequence.offsets[name]
+        worn, motion = sequence.clothing(name), sequence.motion
+        assembly, to_cloth = self.tables(worn)
+        reference = skinning()(motion, worn).positions + sequence.offsets[name]
         clear_caches_if_full()
-        prediction = method(motion, name)
+        prediction = method(motion, worn)
         finite = np.asarray(np.isfinite(prediction.positions).all(axis=(1, 2)))
         shown = np.where(finite[:, None, None], prediction.positions, 0.0)
         x, y = shown[finite], reference[finite]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import load_body, skin_points
+from ..data import Clothing, Worn, garment_of, shape_of
 from ..dressing import (
     EXTERNAL_ENGINES,
     Dresser,
@@ -20,7 +21,6 @@ from ..dressing import (
     infer_block,
     make_dresser,
 )
-from ..garment import Template, template
 from ..geometry import polar_rotation
 from ..models import Predictor, load_predictor
 from ..motion import BLOCK, Motion, clip_transforms, padded_block
@@ -30,6 +30,7 @@ from ..simulation import (
     Scene,
     prepare_scene,
     simulate_batch,
+    standard_effects,
 )
 
 # Perturbation of the body's root that shows how far simulations diverge [m].
@@ -51,10 +52,10 @@ class Prediction:
 
 @runtime_checkable
 class Method(Protocol):
-    """Computes a template's cloth from a motion."""
+    """Computes a garment's cloth from a motion."""
 
-    def __call__(self, motion: Motion, name: Template) -> Prediction:
-        """The template's cloth in every frame."""
+    def __call__(self, motion: Motion, name: Clothing) -> Prediction:
+        """The cloth in every frame."""
         ...
 
 
@@ -65,18 +66,18 @@ class Blockwise:
     Attributes:
         block: Maps a garment, world rotations and translations of joints (including
             ``history`` earlier frames) and the frame rate to cloth.
-        wear: Maps a template's name to the garment in the form that ``block`` takes.
+        wear: Maps a garment to the form that ``block`` takes.
         history: Number of earlier frames that ``block`` uses.
     """
 
     block: Callable[[Any, Array, Array, float], Array]
-    wear: Callable[[Template], Any]
+    wear: Callable[[Clothing], Any]
     history: int = 0
 
-    def __call__(self, motion: Motion, name: Template) -> Prediction:
-        """The template's cloth in every frame."""
+    def __call__(self, motion: Motion, name: Clothing) -> Prediction:
+        """The cloth in every frame."""
         body = load_body()
-        rest = body.rest_vertices(body.default_shape())
+        rest = body.rest_vertices(shape_of(name))
         world, shift = clip_transforms(body, rest, motion)
         worn = self.wear(name)
         blocks, times = [], []
@@ -97,19 +98,23 @@ def skinning() -> Blockwise:
 
 
 @functools.cache
-def _skinned(name: Template) -> Dresser:
-    return make_dresser([name], method="lbs", inference=Inference(collisions=False))
+def _skinned(name: Clothing) -> Dresser:
+    return make_dresser(
+        [garment_of(name)],
+        method="lbs",
+        shape=shape_of(name),
+        inference=Inference(collisions=False),
+    )
 
 
 def _infer(dresser: Dresser, r: Array, t: Array, fps: float) -> Array:
     return infer_block(dresser, r, t, fps)[1][0]
 
 
-def rest_and_skin(name: Template) -> tuple[Array, Array]:
-    """A template's vertices at rest [m] and their skinning weights."""
-    body = load_body()
-    garment = template(name)
-    return garment.rest_vertices(body.rest_vertices(body.default_shape())), garment.skin
+def rest_and_skin(name: Clothing) -> tuple[Array, Array]:
+    """A garment's vertices at rest [m] and their skinning weights."""
+    garment = garment_of(name)
+    return garment.rest_vertices(load_body().rest_vertices(shape_of(name))), garment.skin
 
 
 def place_local(
@@ -141,10 +146,20 @@ def network(inference: Inference, precision: Precision = "float32") -> Blockwise
     loaded = dataclasses.replace(inference, weights=predictor)
 
     @functools.cache
-    def wear(name: Template) -> Dresser:
-        return make_dresser([name], inference=loaded, precision=precision)
+    def wear(name: Clothing) -> Dresser:
+        return make_dresser(
+            [garment_of(name)], shape=shape_of(name), inference=loaded, precision=precision
+        )
 
     return Blockwise(_infer, wear, predictor.config.inputs.window - 1)
+
+
+def scene_of(name: Clothing) -> Scene:
+    """A garment alone, with the effects that a dataset simulates it with."""
+    garment = garment_of(name)
+    if not isinstance(name, Worn):
+        return Scene((garment,))
+    return Scene((garment,), standard_effects((garment,)), None, shape_of(name))
 
 
 class Simulator:
@@ -158,12 +173,12 @@ class Simulator:
 
     def __init__(self, accuracy: str, moved: float = 0.0) -> None:
         self._solver, self._moved = PRESETS[accuracy], moved
-        self._scenes: dict[Template, PreparedScene] = {}
+        self._scenes: dict[Clothing, PreparedScene] = {}
 
-    def __call__(self, motion: Motion, name: Template) -> Prediction:
-        """The template's cloth in every frame."""
+    def __call__(self, motion: Motion, name: Clothing) -> Prediction:
+        """The cloth in every frame."""
         if name not in self._scenes:
-            self._scenes[name] = prepare_scene(Scene((template(name),)))
+            self._scenes[name] = prepare_scene(scene_of(name))
         noise = np.random.default_rng(0).normal(0.0, self._moved, motion.root.shape)
         moved = dataclasses.replace(motion, root=motion.root + jnp.asarray(noise, jnp.float32))
         ticks = [time.perf_counter()]
@@ -188,8 +203,8 @@ def external_engine(name: str) -> Method:
     """
     run = EXTERNAL_ENGINES[name]
 
-    def method(motion: Motion, name: Template) -> Prediction:
-        rollout = run(Scene((template(name),)), motion)
+    def method(motion: Motion, name: Clothing) -> Prediction:
+        rollout = run(scene_of(name), motion)
         # The first frame includes loading and settling.
         laps = rollout.diagnostics["milliseconds"]
         return Prediction(
