@@ -108,23 +108,6 @@ def cut(
     return picked, remap[out], origin
 
 
-def pad_rows(
-    rows: sp.csr_matrix,
-) -> tuple[Int[np.ndarray, "vertices k"], Float[np.ndarray, "vertices k"]]:
-    """Converts sparse rows to index and weight tables, padded with zero weights."""
-    rows = sp.csr_matrix(rows)
-    rows.sum_duplicates()
-    indptr, indices, data = (np.asarray(x) for x in (rows.indptr, rows.indices, rows.data))
-    count = np.diff(indptr)
-    index = np.zeros((len(count), count.max()), dtype=np.int32)
-    weight = np.zeros((len(count), count.max()), dtype=np.float32)
-    for i in range(len(count)):
-        part = slice(indptr[i], indptr[i + 1])
-        index[i, : count[i]] = indices[part]
-        weight[i, : count[i]] = data[part]
-    return index, weight
-
-
 def refine(
     rows: sp.csr_matrix,
     faces: Int[np.ndarray, "faces 3"],

@@ -12,8 +12,8 @@ from jaxtyping import Float, Int
 
 from ..body import Body, load_body
 from ..errors import MeshError
-from ..geometry import TriMesh, boundary_loops, cast_rays, make_mesh, vertex_normals
-from ._cut import cut, pad_rows, refine, split_quads
+from ..geometry import TriMesh, boundary_loops, cast_rays, make_mesh, pad_rows, vertex_normals
+from ._cut import cut, refine, split_quads
 from ._fit import (
     bridge_hollows,
     clearance,

@@ -19,7 +19,7 @@ from ._frames import map_frames as map_frames
 from ._intersect import self_intersections as self_intersections
 from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
 from ._normals import vertex_normals as vertex_normals
-from ._padding import padded_rows as padded_rows
+from ._padding import pad_rows as pad_rows, padded_rows as padded_rows
 from ._polygons import (
     Material as Material,
     Polygons as Polygons,

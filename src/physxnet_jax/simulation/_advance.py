@@ -53,6 +53,7 @@ def advance(
     fps: float,
     time: Float[Array, ""] | float = 0.0,
     energies: bool = False,
+    guide: Float[Array, "frames patches 3 batch"] | None = None,
 ) -> tuple[State, Float[Array, "later vertices 3 batch"], dict[str, Array]]:
     """Advances the cloth through frames 1, 2, ... from its state at frame 0.
 
@@ -69,6 +70,8 @@ def advance(
         fps: Frames per second.
         time: Time of frame 0, for effects that depend on it [s].
         energies: Also return the energy of each effect.
+        guide: Where an effect such as `Guide` draws the cloth to in all frames, in the form of
+            its `means` [m].
 
     Returns:
         The last state, positions of frames 1 and later, and diagnostics of each frame.
@@ -112,9 +115,16 @@ def advance(
             start_time,
         ), None
 
-    def frame(carry: tuple, pose: tuple[Array, Array]) -> tuple[tuple, tuple]:
-        state, before, start_time = carry
-        after = skin(*pose)
+    def frame(carry: tuple, pose: tuple[Array, ...]) -> tuple[tuple, tuple]:
+        state, before, start_time, *drawn = carry
+        after = skin(*pose[:2])
+        if guide is not None:
+            pair = (drawn[0], pose[2])
+            received = tuple(
+                e.receive(s, pair, start_time, 1.0 / fps)
+                for e, s in zip(effects, state.effect_state, strict=True)
+            )
+            state = dataclasses.replace(state, effect_state=received)
         # The loop's carry needs the contexts' shapes; the first interval fills them.
         shapes = jax.eval_shape(
             lambda x, at, effect_state: tuple(
@@ -130,7 +140,7 @@ def advance(
         steps = jnp.arange(solver.contact_updates, dtype=state.position.dtype)
         (state, d, contexts, _, _, _), _ = jax.lax.scan(interval, start, steps)
         info = _diagnose(system, solver, state, d, contexts, h, energies)
-        return (state, after, start_time + 1.0 / fps), (state.position, info)
+        return (state, after, start_time + 1.0 / fps, *pose[2:]), (state.position, info)
 
     if state.effect_state is None:
         effect_state = tuple(e.init_state(state.position.shape[2]) for e in effects)
@@ -140,8 +150,12 @@ def advance(
         state = dataclasses.replace(state, solver_state=solver_state)
     first = skin(rotations[0], root[0])
     start_time = jnp.asarray(time, state.position.dtype)
-    (state, _, _), (positions, diagnostics) = jax.lax.scan(
-        jax.checkpoint(frame), (state, first, start_time), (rotations[1:], root[1:])
+    begins = () if guide is None else (guide[0],)
+    later = () if guide is None else (guide[1:],)
+    (state, *_), (positions, diagnostics) = jax.lax.scan(
+        jax.checkpoint(frame),
+        (state, first, start_time, *begins),
+        (rotations[1:], root[1:], *later),
     )
     return state, positions, diagnostics
 

@@ -106,6 +106,17 @@ class Prepared:
         """Effect state for the next contact interval, with the same structure."""
         return ()
 
+    def receive(self, state: Any, guide: tuple[Array, Array], begins: Array, length: float) -> Any:
+        """Effect state for a frame in which the cloth is drawn from one place to another.
+
+        Args:
+            state: The effect's state.
+            guide: Means [m] at the start and at the end of the frame.
+            begins: Start of the frame [s].
+            length: Length of the frame [s].
+        """
+        return state
+
     def begin(
         self,
         base: Float[Array, "vertices 3 batch"],
