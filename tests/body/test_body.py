@@ -169,7 +169,7 @@ def test_assets_first_loaded_under_jit_contain_no_tracers(rest):
     @jax.jit
     def inside(x):
         kept.extend([load_body.__wrapped__(), template.__wrapped__("top")])
-        kept.append(_cached_atlas.__wrapped__(32, 32))
+        kept.append(_cached_atlas.__wrapped__(32, 32, True))
         kept.append(jnp.zeros(3))
         return x
 
