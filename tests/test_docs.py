@@ -213,6 +213,7 @@ def test_reproduction_page_matches_the_measurements():
         "cloth_memory",
         "clip_start",
         "previous_offset",
+        "oracle",
     ):
         block = re.search(rf"<!-- begin {name} -->\n(.*?)<!-- end {name} -->", text, re.S)
         assert block and block.group(1) == (ROOT / f"experiments/results/{name}.md").read_text()
@@ -238,6 +239,16 @@ def test_reproduction_page_matches_the_measurements():
             assert found is not None
             assert round(found["rmse_vertices_mm"], 2) == line["rmse_vertices_mm"]
         assert card["licence"] and card["acknowledgement"]
+
+
+def test_maps_hold_what_the_page_says():
+    rows = json.loads((ROOT / "experiments/results/oracle.json").read_text())
+    made = runpy.run_path(str(ROOT / "experiments/oracle.py"))
+    assert made["table"](rows) == (ROOT / "experiments/results/oracle.md").read_text()
+    best = [r for r in rows if (r["map"], r["resolution"]) == ("body+skirt", 128)]
+    assert len(best) == 42 and all(r["rmse_mm"] < 2.0 for r in best)
+    over = {(r["kind"], r["action"]) for r in best if r["wrinkle_deg"] > 9.0}
+    assert over == {("shirt", "ballet")}
 
 
 def test_scaling_tables_match_the_measurements():
