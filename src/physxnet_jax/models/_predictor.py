@@ -130,7 +130,7 @@ class Predictor:
         config: Configuration of the network.
         mirror_tta: Whether to average with the prediction for the mirrored pose, see
             `with_mirror_tta`.
-        finer_than: The atlas of the maps of motion, if it is another one.
+        coarse_atlas: The atlas of the maps of motion, where they are coarser.
     """
 
     atlas: Atlas
@@ -140,12 +140,12 @@ class Predictor:
     graph: nnx.GraphDef = dataclasses.field(metadata={"static": True})
     config: ModelConfig = dataclasses.field(metadata={"static": True})
     mirror_tta: bool = dataclasses.field(default=False, metadata={"static": True})
-    finer_than: Atlas | None = None
+    coarse_atlas: Atlas | None = None
 
     @property
     def motion_atlas(self) -> Atlas:
         """The atlas of the maps of motion."""
-        return self.atlas if self.finer_than is None else self.finer_than
+        return self.atlas if self.coarse_atlas is None else self.coarse_atlas
 
     def modulation(
         self, template: str, conditions: Float[Array, "height width channels"]

@@ -287,7 +287,7 @@ def _filled(
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
     texel_points = make_texel_points(coarse or atlas, body, rest, valid)
-    return Predictor(atlas, texel_points, normalisation, state, graph, model, finer_than=coarse)
+    return Predictor(atlas, texel_points, normalisation, state, graph, model, coarse_atlas=coarse)
 
 
 def _parameters(state: Any) -> list[str]:

@@ -394,5 +394,5 @@ def make_predictor(problem: Problem, state: TrainState) -> Predictor:
         values,
         graph,
         problem.config.model,
-        finer_than=problem.motion_atlas if problem.config.model.finer else None,
+        coarse_atlas=problem.motion_atlas if problem.config.model.finer else None,
     )

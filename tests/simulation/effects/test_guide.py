@@ -68,7 +68,7 @@ def test_a_mean_follows_as_a_critically_damped_spring(substeps):
     assert np.abs(moved[..., 0].mean(axis=1) - wanted).max() < 0.25 * shift * (8 / substeps) * 0.5
 
 
-def test_what_is_finer_than_a_patch_is_left_alone():
+def test_what_is_coarse_atlas_a_patch_is_left_alone():
     scene, guide = prepared((sheet(),), Guide(0.16, 0.02))
     x = np.asarray(scene.assembly.rest, np.float32)[:, :, None]
     rough = x.copy()
