@@ -11,11 +11,13 @@ from physxnet_jax.data import Outfit, Sequence, make_wardrobe
 from physxnet_jax.dressing import Inference, clothe, clothe_step, init_stream, make_dresser
 from physxnet_jax.errors import FormatError
 from physxnet_jax.garment import tailor
+from physxnet_jax.geometry import patch_shares
 from physxnet_jax.models import ModelConfig, load_predictor, save_predictor
 from physxnet_jax.motion import load_motion
-from physxnet_jax.training import TrainConfig, train
+from physxnet_jax.training import LossInputs, TrainConfig, train
 from physxnet_jax.training._garment_tables import prepare_garments
-from physxnet_jax.uv import bind
+from physxnet_jax.training._problem import configured_loss
+from physxnet_jax.uv import bind, make_atlas
 
 MODEL = ModelConfig(
     resolution=64, width=4, templates=("top",), skirt_chart=True, finer=True, conditions=True
@@ -70,6 +72,49 @@ def test_tables_sample_as_bindings_do():
         assert float(tables["top"].present[k].sum()) == n
     with pytest.raises(FormatError, match="no 'bottom' in the data"):
         prepare_garments(dataclasses.replace(MODEL, templates=("bottom",)), wardrobe)
+
+
+def test_means_are_those_of_patches():
+    wardrobe = make_wardrobe([TIGHT, LOOSE], ("top",))
+    *_, tables = prepare_garments(MODEL, wardrobe)
+    table, both = tables["top"], jnp.asarray([0, 1])
+    x = jax.random.normal(jax.random.key(1), (2, wardrobe.num_vertices("top"), 3))
+    means, weight = table.means(x, both)
+    for k, garment in enumerate(wardrobe.garments["top"]):
+        mesh, n = garment.mesh, garment.num_vertices
+        shares = patch_shares(np.asarray(mesh.vertices), np.asarray(mesh.faces), 0.08).toarray()
+        wanted = shares.T @ np.asarray(x[k, :n]) / shares.sum(axis=0)[:, None]
+        np.testing.assert_allclose(means[k, : len(wanted)], wanted, atol=1e-5)
+        assert float(jnp.abs(weight[k, len(wanted) :]).sum()) == 0.0
+        assert float(weight[k].sum()) == pytest.approx(n, rel=1e-4)
+    flat = np.asarray(table.means(jnp.ones_like(x), both)[0])
+    np.testing.assert_allclose(flat[np.asarray(weight) > 0.0], 1.0, atol=1e-5)
+
+
+def test_share_of_patches_weighs_both_parts():
+    def inputs():
+        x = jnp.zeros((1, 2, 3))
+        return LossInputs(
+            maps=jnp.zeros((1, 4, 4, 3)),
+            texels=x,
+            target=None,
+            valid=jnp.ones(2, bool),
+            weight=jnp.ones(1),
+            vertices=x,
+            vertex_target=x + jnp.asarray([0.3, -0.3])[None, :, None],
+            present=jnp.ones((1, 2)),
+            edges=None,
+            means=(jnp.zeros((1, 1, 3)), jnp.full((1, 1, 3), 0.1), jnp.ones((1, 1))),
+            atlas=make_atlas(32),
+        )
+
+    for share, wanted in ((0.0, 0.3), (0.25, 0.25), (1.0, 0.1)):
+        loss = configured_loss(dataclasses.replace(CONFIG, patch_share=share))
+        assert float(loss(inputs())) == pytest.approx(wanted, rel=1e-5)
+    wrong = (({"patch_share": 2.0}, "from 0 to 1"), ({"patch_share": 0.5}, "conditions"))
+    for given, says in wrong:
+        with pytest.raises(ValueError, match=says):
+            TrainConfig(**given)
 
 
 @pytest.mark.parametrize("wrong", [{"adversarial": True}, {"vertex_share": 1.0, "edge_share": 0.5}])

@@ -20,6 +20,7 @@ from ._intersect import self_intersections as self_intersections
 from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
 from ._normals import vertex_normals as vertex_normals
 from ._padding import pad_rows as pad_rows, padded_rows as padded_rows
+from ._patches import patch_shares as patch_shares
 from ._polygons import (
     Material as Material,
     Polygons as Polygons,

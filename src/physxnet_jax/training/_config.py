@@ -33,6 +33,9 @@ class TrainConfig:
             error. 0 is the paper's; ``local`` only.
         edge_share: Share of the loss at vertices that applies to differences along the
             templates' edges, which determine strain and folds.
+        patch_share: Share of the loss that is taken at means over patches of 8 cm instead of at
+            vertices: folds within a patch are chaotic, their mean isn't. Only with
+            ``model.conditions``.
         pyramid_levels: The loss at texels is the mean over this many resolutions of maps, each
             half the previous one; 1 is the paper's.
         adversarial: Whether to train with a discriminator.
@@ -64,6 +67,7 @@ class TrainConfig:
     loss: Literal["l1", "l2"] = "l1"
     vertex_share: float = 0.0
     edge_share: float = 0.0
+    patch_share: float = 0.0
     pyramid_levels: int = 1
     adversarial: bool = True
     discriminator_width: int = 16
@@ -92,6 +96,10 @@ class TrainConfig:
             raise ValueError(f"edge_share is {self.edge_share}; it must be from 0 to 1.")
         if self.edge_share and not self.vertex_share:
             raise ValueError("edge_share is a share of vertex_share, which is 0.")
+        if not 0.0 <= self.patch_share <= 1.0:
+            raise ValueError(f"patch_share is {self.patch_share}; it must be from 0 to 1.")
+        if self.patch_share and not self.model.conditions:
+            raise ValueError("patch_share needs model.conditions.")
         if self.model.conditions and (self.adversarial or self.edge_share):
             raise ValueError(
                 "conditions: every sample has a garment of its own, whose vertices alone are"

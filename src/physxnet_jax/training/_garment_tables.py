@@ -10,10 +10,14 @@ from jaxtyping import Array, Float, Int
 from ..body import load_body
 from ..data import QUANTIZATION_STEP, Frames, Wardrobe
 from ..errors import FormatError
+from ..geometry import pad_rows, patch_shares
 from ..models import ModelConfig, Normalisation, TexelPoints, make_texel_points
 from ..typing import pytree
 from ..uv import Atlas, bind, condition_maps, make_atlas
 from ._targets import motion_scales, scale_of
+
+# Distance between the middles of patches [m], as in a guided simulation.
+_PATCH = 0.08
 
 
 @pytree
@@ -27,12 +31,33 @@ class GarmentTables:
         present: 1 for vertices, 0 for padding, shape [garments, vertices].
         conditions: What the network sees of each garment, shape [garments, height, width,
             channels].
+        patch: Patches of 8 cm that each vertex belongs to, shape [garments, vertices, m].
+        share: Their shares in the vertex, shape [garments, vertices, m].
+        patches: Number of patches of the garment that has most.
     """
 
     texel: Int[Array, "garments vertices k"]
     weight: Float[Array, "garments vertices k"]
     present: Float[Array, "garments vertices"]
     conditions: Float[Array, "garments height width channels"]
+    patch: Int[Array, "garments vertices m"]
+    share: Float[Array, "garments vertices m"]
+    patches: int = dataclasses.field(metadata={"static": True})
+
+    def means(
+        self, values: Float[Array, "batch vertices 3"], garment: Int[Array, " batch"]
+    ) -> tuple[Float[Array, "batch patches 3"], Float[Array, "batch patches"]]:
+        """Means of vertex values over the patches of one garment each, and their weights."""
+
+        def one(x: Array, g: Array) -> tuple[Array, Array]:
+            share = self.share[g] * self.present[g][:, None]
+            rows = self.patch[g].ravel()
+            weight = jnp.zeros(self.patches, x.dtype).at[rows].add(share.ravel())
+            parts = (share[:, :, None] * x[:, None, :]).reshape(-1, 3)
+            total = jnp.zeros((self.patches, 3), x.dtype).at[rows].add(parts)
+            return total / jnp.maximum(weight, 1e-6)[:, None], weight
+
+        return jax.vmap(one)(values, garment)
 
     def sample(
         self, maps: Float[Array, "batch texels 3"], garment: Int[Array, " batch"]
@@ -90,6 +115,10 @@ def prepare_garments(
         maps = [
             condition_maps(atlas, body, rest, g, b) for g, b in zip(garments, bound, strict=True)
         ]
+        shares = [
+            pad_rows(patch_shares(np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces), _PATCH))
+            for g in garments
+        ]
         tables[name] = GarmentTables(
             texel=jnp.asarray(np.stack([_padded(b.texel, count) for b in bound])),
             weight=jnp.asarray(np.stack([_padded(b.weight, count) for b in bound])),
@@ -97,13 +126,16 @@ def prepare_garments(
                 np.stack([np.arange(count) < g.num_vertices for g in garments]).astype(np.float32)
             ),
             conditions=jnp.stack(maps),
+            patch=jnp.asarray(np.stack([_padded(i, count) for i, _ in shares])),
+            share=jnp.asarray(np.stack([_padded(w, count) for _, w in shares])),
+            patches=max(int(i.max()) + 1 for i, _ in shares),
         )
     points = make_texel_points(motion_atlas, body, rest, valid)
     rests = jnp.stack([motion_atlas.at_texels(r) for r in wardrobe.rests()])
     return atlas, motion_atlas, points, Persons(rest=rests), tables
 
 
-def _padded(values: Array, count: int) -> np.ndarray:
+def _padded(values: Array | np.ndarray, count: int) -> np.ndarray:
     v = np.asarray(values)
     return np.concatenate([v, np.zeros((count - len(v), v.shape[1]), v.dtype)])
 

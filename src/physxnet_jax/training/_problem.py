@@ -72,6 +72,8 @@ class LossInputs:
         present: 1 for vertices, 0 for padding, shape [batch, vertices].
         edges: Vertices of the garment's edges, shape [edges, 2]; None where every sample has a
             garment of its own.
+        means: Means of ``vertices`` over patches of 8 cm, of ``vertex_target``, and the weights of
+            the patches, where every sample has a garment of its own; else None.
         atlas: The atlas of the maps.
     """
 
@@ -84,6 +86,7 @@ class LossInputs:
     vertex_target: Float[Array, "batch vertices 3"]
     present: Float[Array, "batch vertices"]
     edges: Array | None
+    means: tuple[Array, Array, Array] | None
     atlas: Atlas
 
 
@@ -138,13 +141,14 @@ def configured_loss(config: TrainConfig) -> Loss:
     distance = masked_l2 if config.loss == "l2" else masked_l1
 
     def loss(x: LossInputs) -> Float[Array, ""]:
-        if x.target is None or x.edges is None:
-            return vertex_distance(
-                x.vertices,
-                x.vertex_target,
-                x.present * x.weight[:, None],
-                squared=config.loss == "l2",
-            )
+        if x.target is None or x.edges is None or x.means is not None:
+            squared, weight = config.loss == "l2", x.weight[:, None]
+            fine = vertex_distance(x.vertices, x.vertex_target, x.present * weight, squared=squared)
+            if not config.patch_share or x.means is None:
+                return fine
+            ours, theirs, patch_weight = x.means
+            coarse = vertex_distance(ours, theirs, patch_weight * weight, squared=squared)
+            return (1.0 - config.patch_share) * fine + config.patch_share * coarse
         if config.pyramid_levels == 1:
             at_texels = distance(x.texels, x.target, x.valid, x.weight)
         else:

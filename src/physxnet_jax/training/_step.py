@@ -72,7 +72,11 @@ def _loss_inputs(
     if isinstance(table, GarmentTables):
         garment = batch[f"garment_{t}"]
         vertices, present, edges = table.sample(seen, garment), table.present[garment], None
+        scaled = stored / problem.normalisation.offset[t]
+        (ours, weight), (theirs, _) = (table.means(x, garment) for x in (vertices, scaled))
+        means = (ours, theirs, weight)
     else:
+        means = None
         vertices, edges = table.bound.sample(seen), table.edges
         present = jnp.ones(vertices.shape[:2], jnp.float32)
     return LossInputs(
@@ -85,6 +89,7 @@ def _loss_inputs(
         vertex_target=stored / problem.normalisation.offset[t],
         present=present,
         edges=edges,
+        means=means,
         atlas=problem.atlas,
     )
 

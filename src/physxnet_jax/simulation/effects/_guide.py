@@ -1,22 +1,19 @@
 """Guide: patch means of the cloth are drawn to where a prediction has them."""
 
 import dataclasses
+import itertools
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
-from scipy.sparse.csgraph import dijkstra
 
 from ...errors import check_numbers
-from ...geometry import mesh_edges, pad_rows
+from ...geometry import pad_rows, patch_shares
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, Prepared, Step
-
-# Patches that a vertex belongs to, and their width over the distance of their middles [1].
-_SHARED, _WIDTH = 4, 0.7
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,7 +36,11 @@ class Guide(Effect):
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Divides every garment into patches."""
-        shares = _partition(assembly.rest, assembly.faces, assembly.parts, self.spacing)
+        parts = [
+            patch_shares(assembly.rest[a:b], faces_between(assembly.faces, a, b), self.spacing)
+            for a, b in itertools.pairwise(assembly.parts)
+        ]
+        shares = sp.csr_matrix(sp.block_diag(parts))
         means = shares.T.multiply(assembly.mass[None]).tocsr()
         means = sp.diags(1.0 / np.asarray(means.sum(axis=1)).ravel()) @ means
         index, weight = pad_rows(means)
@@ -145,39 +146,8 @@ def _combine(values: Array, index: Array, weight: Array) -> Array:
     return out
 
 
-def _partition(
-    rest: Float[np.ndarray, "vertices 3"],
-    faces: Int[np.ndarray, "faces 3"],
-    parts: tuple[int, ...],
-    spacing: float,
-) -> sp.csr_matrix:
-    """Shares of patches in vertices, which sum to 1: smooth along the cloth."""
-    edges = mesh_edges(faces).vertices
-    length = np.linalg.norm(rest[edges[:, 0]] - rest[edges[:, 1]], axis=1)
-    graph = sp.csr_matrix(
-        (np.maximum(length, 1e-9), (edges[:, 0], edges[:, 1])), (len(rest), len(rest))
-    )
-    rows, columns, weights, count = [], [], [], 0
-    for first, last in zip(parts, parts[1:]):
-        # Farthest points: each new middle lies where the others are farthest.
-        own = graph[first:last, first:last]
-        found, nearest = [], np.full(last - first, np.inf)
-        while nearest.max() > spacing:
-            far = dijkstra(own, directed=False, indices=int(nearest.argmax()), limit=4.0 * spacing)
-            found.append(far)
-            nearest = np.minimum(nearest, far)
-        distance = np.stack(found, axis=1)
-        chosen = np.argsort(distance, axis=1, kind="stable")[:, :_SHARED]
-        near = np.take_along_axis(distance, chosen, axis=1)
-        share = np.exp(-((near / (_WIDTH * spacing)) ** 2))
-        share /= share.sum(axis=1, keepdims=True)
-        rows.append(np.repeat(np.arange(first, last), chosen.shape[1]))
-        columns.append(count + chosen.ravel())
-        weights.append(share.ravel())
-        count += distance.shape[1]
-    matrix = sp.csr_matrix(
-        (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))),
-        (len(rest), count),
-    )
-    matrix.eliminate_zeros()
-    return matrix
+def faces_between(
+    faces: Int[np.ndarray, "faces 3"], first: int, last: int
+) -> Int[np.ndarray, "some 3"]:
+    """The faces of one garment, with vertices counted from its first."""
+    return faces[(faces[:, 0] >= first) & (faces[:, 0] < last)] - first
