@@ -42,8 +42,7 @@ class Outfit:
 
     def params(self) -> Float[Array, " shapes"]:
         """The person's shape parameters, see `Body.shape`."""
-        pairs = (word.partition("=") for word in self.shape)
-        return load_body().shape(**{name: float(value) for name, _, value in pairs})
+        return person_shape(self.shape)
 
     def garments(self) -> dict[str, Garment]:
         """The garments by template, innermost first.
@@ -52,6 +51,12 @@ class Outfit:
             PhysXNetError: Two garments of one template, or a measure out of range.
         """
         return _garments(self)
+
+
+def person_shape(words: tuple[str, ...]) -> Float[Array, " shapes"]:
+    """Shape parameters from ``name=value``, see `Body.shape`."""
+    pairs = (word.partition("=") for word in words)
+    return load_body().shape(**{name: float(value) for name, _, value in pairs})
 
 
 @functools.lru_cache(maxsize=64)

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from ..body import load_body
 from ..garment import Garment, template
-from ._outfit import Outfit
+from ._outfit import Outfit, person_shape
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,11 +38,6 @@ class Wardrobe:
         """Rest vertices of the persons [m]."""
         body = load_body()
         return [body.rest_vertices(person_shape(p)) for p in self.persons]
-
-
-def person_shape(shape: tuple[str, ...]) -> Float[Array, " shapes"]:
-    """Shape parameters from ``name=value``."""
-    return Outfit(wear=("tee",), shape=shape).params()
 
 
 def make_wardrobe(outfits: Iterable[Outfit | None], templates: Items[str]) -> Wardrobe:

@@ -174,8 +174,8 @@ class Predictor:
             translations: World translations of joints [m], likewise.
             fps: Frames per second.
             templates: Templates whose maps to predict.
-            modulation: Of the garment of each template, see `modulation`. Without it a garment of
-                cotton without ease is assumed.
+            modulation: Of the garment of each template, see `modulation`. A network that sees
+                garments has learned nothing without it.
 
         Returns:
             Offsets of covered texels; zero where the template doesn't cover them.
