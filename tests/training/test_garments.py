@@ -1,13 +1,23 @@
 """Networks that see the garment: they learn what depends on it."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physxnet_jax.data import Outfit, Sequence, make_wardrobe
+from physxnet_jax.body import load_body
+from physxnet_jax.data import (
+    FrameStream,
+    Outfit,
+    Sequence,
+    TemplateStreams,
+    load_frames,
+    make_wardrobe,
+    read_entry,
+)
 from physxnet_jax.dressing import Inference, clothe, clothe_step, init_stream, make_dresser
 from physxnet_jax.errors import FormatError
 from physxnet_jax.garment import tailor
@@ -166,3 +176,31 @@ def test_garments_of_one_template_have_maps_of_their_own(learned, body, tmp_path
         stream, now = clothe_step(dresser, stream, q[k], p[k], 30.0)
         for g in garments:
             np.testing.assert_allclose(now[g.name], both[g.name][k], atol=1e-4)
+
+
+def test_rows_have_a_sample_of_each_template():
+    """Whichever part of the rows is loaded, it is that part of the whole batch."""
+    tops = [sequence(TIGHT, 0.0), sequence(LOOSE, -OFF)]
+    entries = [read_entry(s) for s in tops]
+    w = make_wardrobe([e.outfit for e in entries], ("top",))
+    load = functools.partial(
+        load_frames, wardrobe=w, body=load_body(), window=MODEL.inputs.window, local=True
+    )
+    each = {
+        name: FrameStream(chosen, load, lambda s: s, batch=4, seed=seed, capacity=1000)
+        for seed, (name, chosen) in enumerate({"top": entries, "other": entries[:1]}.items())
+    }
+    streams = TemplateStreams({"top": each["top"]})
+    assert streams.fps == 30.0 and streams.steps_per_epoch == 12
+    both = TemplateStreams(each)
+    assert both.steps_per_epoch == 12 and "other: walk" in both.identity
+    whole, part = both.batches(3, slice(0, 4)), both.batches(3, slice(1, 3))
+    try:
+        for _ in range(10):
+            a, b = next(whole), next(part)
+            assert a["rotations"].shape[:2] == (4, 2) and a["garment_top"].shape == (4,)
+            for k in a:
+                np.testing.assert_array_equal(b[k], a[k][1:3])
+    finally:
+        whole.close()
+        part.close()

@@ -452,6 +452,7 @@ def test_padding_of_the_last_batch_does_not_affect_validation(monkeypatch):
     monkeypatch.setattr(_loop, "take", take)
     # What is handed over only looks like frames and steps.
     validate = inspect.unwrap(_loop._validate)
+    monkeypatch.setattr(_loop, "_held_batches", inspect.unwrap(_loop._held_batches))
     monkeypatch.setattr(_loop, "eval_step", lambda problem, *rest: look(*rest))
     found, _ = validate(SimpleNamespace(config=config), None, range(25), make_mesh(8))
     assert found["validation_mm"] == pytest.approx(errors[::3].mean())

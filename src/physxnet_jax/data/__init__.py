@@ -11,6 +11,10 @@ from ._frames import (
     take as take,
     usable_garment as usable_garment,
 )
+from ._garment_stream import (
+    TemplateStreams as TemplateStreams,
+    join_templates as join_templates,
+)
 from ._mirror import mirrored_offsets as mirrored_offsets, mirrored_sequence as mirrored_sequence
 from ._outfit import (
     Clothing as Clothing,

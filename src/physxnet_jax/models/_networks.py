@@ -171,6 +171,14 @@ class Generator(nnx.Module):
         Raises:
             ValueError: A size that isn't a multiple of 16, or of 48 with the chart of skirts.
         """
+        features = self.encode(x)
+        known = modulation or {}
+        return {t: self.decode(t, features, known.get(t)) for t in templates}
+
+    def encode(
+        self, x: Float[Array, "batch height width channels"]
+    ) -> list[Float[Array, "batch _h _w _c"]]:
+        """Features of maps of motion, finest first."""
         rows = 3 * 2**LEVELS if self.skirt else 2**LEVELS
         if x.shape[1] % rows or x.shape[2] % 2**LEVELS:
             raise ValueError(
@@ -182,14 +190,20 @@ class Generator(nnx.Module):
         for layer in self.encoder:
             x = layer(x)
             features.append(x)
-        known, out = modulation or {}, {}
-        for t in templates:
-            seen = [self._used(t, f) for f in features]
-            m = self.decoders[t](seen, known.get(t))
-            # Rows of the chart that was left out.
-            missing = m.shape[1] * features[0].shape[1] // seen[0].shape[1] - m.shape[1]
-            out[t] = jnp.pad(m, ((0, 0), (0, missing), (0, 0), (0, 0))) if missing else m
-        return out
+        return features
+
+    def decode(
+        self,
+        template: str,
+        features: Sequence[Float[Array, "batch _h _w _c"]],
+        modulation: Modulation | None = None,
+    ) -> Float[Array, "batch h w 3"]:
+        """A template's map of normalised offsets, from what `encode` gave."""
+        seen = [self._used(template, f) for f in features]
+        m = self.decoders[template](seen, modulation)
+        # Rows of the chart that was left out.
+        missing = m.shape[1] * features[0].shape[1] // seen[0].shape[1] - m.shape[1]
+        return jnp.pad(m, ((0, 0), (0, missing), (0, 0), (0, 0))) if missing else m
 
 
 class Discriminator(nnx.Module):

@@ -14,7 +14,8 @@ class TrainConfig:
     Attributes:
         model: The network.
         epochs: Passes over the training frames.
-        batch: Frames per step.
+        batch: Frames per step; of each template with ``model.conditions``, where every sample has
+            a garment of its own.
         learning_rate: Adam's learning rate for the generator.
         discriminator_rate: Adam's learning rate for the discriminator.
         b1: Adam's b1; 0.5 is usual with a discriminator.

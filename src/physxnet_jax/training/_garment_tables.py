@@ -1,6 +1,7 @@
 """What a network that sees garments learns from: many garments of each template, on many bodies."""
 
 import dataclasses
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
@@ -141,7 +142,7 @@ def _padded(values: Array | np.ndarray, count: int) -> np.ndarray:
 
 
 def measure_garment_normalisation(
-    frames: Frames,
+    frames: Mapping[str, Frames],
     points: TexelPoints,
     tables: dict[str, GarmentTables],
     *,
@@ -150,19 +151,28 @@ def measure_garment_normalisation(
 ) -> Normalisation:
     """`measure_normalisation` for offsets at vertices: 99.9 % of values lie in [-1, 1].
 
+    Args:
+        frames: Training frames of each template.
+        points: Texels on the body.
+        tables: All garments.
+        samples: Frames from which velocities and accelerations are measured.
+        seed: Seed of their choice.
+
     Raises:
         FormatError: A template has no usable frame.
     """
-    velocity, acceleration = motion_scales(frames, points, samples=samples, seed=seed)
+    moving = next(iter(frames.values()))
+    velocity, acceleration = motion_scales(moving, points, samples=samples, seed=seed)
     offsets = {}
     for name, table in tables.items():
-        good = np.flatnonzero(frames.usable[name])
+        own = frames[name]
+        good = np.flatnonzero(own.usable[name])
         if len(good) == 0:
             raise FormatError(
                 f"no usable sequence for '{name}': simulate it, or drop it from the templates."
             )
         rng = np.random.default_rng(seed)
         chosen = rng.choice(good, min(64, len(good)), replace=False)
-        there = np.asarray(table.present)[frames.garment[name][chosen]] > 0.0
-        offsets[name] = scale_of(np.abs(frames.targets[name][chosen][there] * QUANTIZATION_STEP))
+        there = np.asarray(table.present)[own.garment[name][chosen]] > 0.0
+        offsets[name] = scale_of(np.abs(own.targets[name][chosen][there] * QUANTIZATION_STEP))
     return Normalisation(velocity, acceleration, offsets)

@@ -5,7 +5,7 @@ import functools
 import json
 import pathlib
 import time
-from collections.abc import Callable, Sequence as Items
+from collections.abc import Callable, Iterator, Sequence as Items
 from typing import Any
 
 import jax
@@ -21,7 +21,10 @@ from ..data import (
     Frames,
     FrameStream,
     Sequence,
+    TemplateStreams,
+    Wardrobe,
     Where,
+    join_templates,
     load_frames,
     make_wardrobe,
     mirrored_sequence,
@@ -121,8 +124,8 @@ def train(
 class _Data:
     """Frames to learn from, and the tables and scales that come with them."""
 
-    frames: FrameStream
-    unseen: Frames | None
+    frames: FrameStream | TemplateStreams
+    unseen: Frames | dict[str, Frames] | None
     atlas: Atlas
     texel_points: TexelPoints
     tables: dict[str, ClothTables] | dict[str, GarmentTables]
@@ -137,54 +140,76 @@ def _load_data(config: TrainConfig, sequences: Items[Sequence | Where | Entry]) 
     wardrobe = make_wardrobe([e.outfit for e in entries], model.templates)
     if not model.conditions and any(wardrobe.outfits):
         raise FormatError("these data hold outfits; learn from them with conditions = true.")
-    held = [e.read() for e in _held_out(config, entries)]
+    held = _held_out(config, entries)
     used = [e for e in entries if e.action not in config.validation]
     if config.mirror_augmentation:
         used += [dataclasses.replace(e, mirrored=True) for e in used]
-    load = functools.partial(
-        load_frames,
-        wardrobe=wardrobe,
-        body=body,
-        window=model.inputs.window,
-        local=model.family == "local",
-    )
-    frames = FrameStream(
-        used,
-        load,
-        functools.partial(mirrored_sequence, body),
-        batch=config.batch,
-        seed=config.seed,
-        capacity=config.frames_in_memory,
-    )
-    unseen = load(held) if held else None
-    if unseen is not None and not any(x.any() for x in unseen.usable.values()):
-        raise FormatError(
-            f"no usable cloth in {', '.join(config.validation)}: validate on another action."
+
+    def frames_of(seen: Wardrobe, capacity: int) -> tuple[FrameStream, Frames | None]:
+        """Frames to learn from and to validate on, of those who wear something of a wardrobe."""
+        load = functools.partial(
+            load_frames,
+            wardrobe=seen,
+            body=body,
+            window=model.inputs.window,
+            local=model.family == "local",
         )
-    first = frames.first()
-    if model.conditions:
-        atlas, motion_atlas, points, persons, garments = prepare_garments(model, wardrobe)
+        worn = {e for t, e in seen.numbers if t in seen.garments}
+        stream = FrameStream(
+            [e for e in used if e.outfit in worn],
+            load,
+            functools.partial(mirrored_sequence, body),
+            batch=config.batch,
+            seed=config.seed,
+            capacity=capacity,
+        )
+        unseen = [e.read() for e in held if e.outfit in worn]
+        return stream, load(unseen) if unseen else None
+
+    if not model.conditions:
+        stream, unseen = frames_of(wardrobe, config.frames_in_memory)
+        _check_usable(config, [unseen])
+        atlas, points, tables = prepare_targets(model)
+        first = stream.first()
+        scales = measure_normalisation(first, points, tables, model.family, seed=config.seed)
         return _Data(
-            frames=frames,
+            frames=stream,
             unseen=unseen,
             atlas=atlas,
             texel_points=points,
-            tables=garments,
-            persons=persons,
-            motion_atlas=motion_atlas,
-            normalisation=measure_garment_normalisation(first, points, garments, seed=config.seed),
+            tables=tables,
+            persons=None,
+            motion_atlas=atlas,
+            normalisation=scales,
         )
-    atlas, points, tables = prepare_targets(model)
+    atlas, motion_atlas, points, persons, garments = prepare_garments(model, wardrobe)
+    share = config.frames_in_memory // len(model.templates)
+    each = {
+        t: frames_of(dataclasses.replace(wardrobe, garments={t: wardrobe.garments[t]}), share)
+        for t in model.templates
+    }
+    known = {t: u for t, (_, u) in each.items() if u is not None}
+    _check_usable(config, list(known.values()))
+    streams = TemplateStreams({t: s for t, (s, _) in each.items()})
+    scales = measure_garment_normalisation(streams.first(), points, garments, seed=config.seed)
     return _Data(
-        frames=frames,
-        unseen=unseen,
+        frames=streams,
+        unseen=known if len(known) == len(each) else None,
         atlas=atlas,
         texel_points=points,
-        tables=tables,
-        persons=None,
-        motion_atlas=atlas,
-        normalisation=measure_normalisation(first, points, tables, model.family, seed=config.seed),
+        tables=garments,
+        persons=persons,
+        motion_atlas=motion_atlas,
+        normalisation=scales,
     )
+
+
+def _check_usable(config: TrainConfig, unseen: Items[Frames | None]) -> None:
+    known = [f for f in unseen if f is not None]
+    if known and not any(x.any() for f in known for x in f.usable.values()):
+        raise FormatError(
+            f"no usable cloth in {', '.join(config.validation)}: validate on another action."
+        )
 
 
 class _Run:
@@ -327,31 +352,40 @@ def _held_out(config: TrainConfig, sequences: Items[Entry]) -> list[Entry]:
 
 
 def _validate(
-    problem: Problem, state: TrainState, frames: Frames, mesh: Mesh
+    problem: Problem, state: TrainState, frames: Frames | dict[str, Frames], mesh: Mesh
 ) -> tuple[dict[str, float], dict[str, tuple[np.ndarray, np.ndarray]]]:
     """Mean absolute errors [mm] on held-out frames, and maps of a frame in the middle."""
     config = problem.config
     sums = dict.fromkeys(config.model.templates, 0.0)
     weights = dict.fromkeys(config.model.templates, 0.0)
     shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    # Neighbouring frames are nearly identical.
-    order = np.arange(0, len(frames), 3)
-    for start in range(0, len(order), config.batch):
-        real = order[start : start + config.batch]
-        batch = take(frames, np.resize(real, config.batch))
-        for t in config.model.templates:
-            # Padding of the last batch has zero weight.
-            batch[f"weight_{t}"][len(real) :] = 0.0
+    held = list(_held_batches(frames, config.batch))
+    for n, batch in enumerate(held):
         losses, maps = eval_step(problem, state, repeated(mesh, batch))
         for t, value in losses.items():
             count = float(batch[f"weight_{t}"].sum())
             sums[t] += count * float(value)
             weights[t] += count
-        if start <= len(order) // 2 < start + config.batch:
+        if n == len(held) // 2:
             shown = {t: (np.asarray(a[0]), np.asarray(b[0])) for t, (a, b) in maps.items()}
     # Templates without usable cloth are left out.
     each = {f"validation_mm_{t}": sums[t] / weights[t] for t in sums if weights[t]}
     return {"validation_mm": float(np.mean(list(each.values()))), **each}, shown
+
+
+def _held_batches(frames: Frames | dict[str, Frames], size: int) -> Iterator[dict[str, np.ndarray]]:
+    """Every third frame: neighbours are nearly identical."""
+    parts = frames if isinstance(frames, dict) else {"": frames}
+    orders = {k: np.arange(0, len(f), 3) for k, f in parts.items()}
+    for start in range(0, max(map(len, orders.values())), size):
+        taken = {}
+        for name, order in orders.items():
+            real = order[start : start + size]
+            taken[name] = take(parts[name], np.resize(real if len(real) else order[:1], size))
+            # Padding has zero weight.
+            for key in [k for k in taken[name] if k.startswith("weight_")]:
+                taken[name][key][len(real) :] = 0.0
+        yield join_templates(taken) if isinstance(frames, dict) else taken[""]
 
 
 def _check_same_run(path: pathlib.Path, text: str) -> None:

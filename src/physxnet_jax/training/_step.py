@@ -30,16 +30,16 @@ def _prepare(problem: Problem, batch: Batch) -> tuple[Array, dict[str, Array], d
     """Motion maps, normalised targets at texels, and masks of the texels that count."""
     config, points = problem.config, problem.texel_points
     inputs = config.model.inputs
-    persons = problem.persons
-    rest = points.rest[None] if persons is None else persons.rest[batch["person"]]
-    rest = jnp.broadcast_to(rest, (len(batch["rotations"]), *rest.shape[1:]))
+    persons, names = problem.persons, ("rotations", "translations")
+    if persons is None:
+        rotations, translations = (batch[k] for k in names)
+        rest = jnp.broadcast_to(points.rest[None], (len(rotations), *points.rest.shape))
+    else:
+        # Every template has samples of its own: all of them are one batch of motion.
+        rotations, translations = (jnp.concatenate(jnp.unstack(batch[k], axis=1)) for k in names)
+        rest = persons.rest[jnp.concatenate(jnp.unstack(batch["person"], axis=1))]
     features = jax.vmap(clip_features, in_axes=(0, None, 0, 0, None, None))(
-        rest,
-        points.weights,
-        batch["rotations"],
-        batch["translations"],
-        problem.fps,
-        inputs,
+        rest, points.weights, rotations, translations, problem.fps, inputs
     )
     x = problem.motion_atlas.to_map(normalise(features[:, 0], problem.normalisation, inputs))
     targets, masks = {}, {}
@@ -94,12 +94,16 @@ def _loss_inputs(
     )
 
 
-def _modulation(problem: Problem, network: Any, batch: Batch, dtype: Any) -> dict[str, Any]:
-    """What each sample's garments change in their decoders."""
-    out = {}
-    for t in problem.config.model.templates:
+def _maps_of_garments(
+    problem: Problem, network: Any, x: Array, batch: Batch, dtype: Any
+) -> dict[str, Array]:
+    """Maps of every template for its own samples, which all went through the encoder."""
+    templates, out = problem.config.model.templates, {}
+    parts = [jnp.split(f, len(templates)) for f in network.encode(x)]
+    for k, t in enumerate(templates):
         conditions = problem.tables[t].conditions[batch[f"garment_{t}"]]  # pyright: ignore
-        out[t] = network.modulation(t, conditions.astype(dtype))
+        known = network.modulation(t, conditions.astype(dtype))
+        out[t] = network.decode(t, [f[k] for f in parts], known)
     return out
 
 
@@ -288,8 +292,7 @@ def _apply_generator(
     def call(network: Any, maps: Array) -> Any:
         if not config.model.conditions:
             return network(maps, config.model.templates)
-        known = _modulation(problem, network, batch, dtype)
-        return network(maps, config.model.templates, known)
+        return _maps_of_garments(problem, network, maps, batch, dtype)
 
     return _apply_network(
         problem.generator, params, state.generator_rest, x, dtype=dtype, train=train, call=call
