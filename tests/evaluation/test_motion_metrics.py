@@ -7,8 +7,10 @@ from physxnet_jax.evaluation import (
     acceleration_error,
     area_strain,
     dihedral_angles,
+    fold_spectrum,
     fold_strength,
     jitter,
+    spectrum_distance,
     wrinkle_error,
 )
 from physxnet_jax.garment import square_sheet
@@ -68,3 +70,22 @@ def test_jerk_and_acceleration_of_polynomials_are_exact():
     assert acceleration_error(y, np.zeros_like(y), 30.0) == pytest.approx(2.0, rel=1e-6)
     assert jitter(y, 30.0) < 1e-6
     assert jitter(x[:3], 30.0) == 0.0 and acceleration_error(x[:2], x[:2], 30.0) == 0.0
+
+
+@pytest.mark.parametrize(("wavelength", "band"), [(0.14, 0), (0.07, 1), (0.035, 2)])
+def test_folds_are_found_at_their_length(wavelength, band):
+    n, side = 81, 0.56
+    u, v = np.meshgrid(np.linspace(0, side, n), np.linspace(0, side, n), indexing="ij")
+    rest = np.stack([u.ravel(), np.zeros(n * n), v.ravel()], 1)
+    at = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (q.ravel() for q in (at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    folded = rest.copy()
+    folded[:, 1] = 0.002 * np.cos(2.0 * np.pi * rest[:, 0] / wavelength)
+    power = fold_spectrum(rest, faces, folded[None])
+    assert np.argmax(power) == band and power[band] > 0.38 * power.sum()
+    # Half as high folds have a quarter of the power at all lengths.
+    folded[:, 1] *= 0.5
+    half = fold_spectrum(rest, faces, folded[None])
+    assert spectrum_distance(half, power) == pytest.approx(np.log(4.0), rel=0.1)
+    assert spectrum_distance(power, power) == 0.0

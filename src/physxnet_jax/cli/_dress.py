@@ -48,7 +48,7 @@ class _Job:
     motion: Motion | Character
     wear: Any
     shape: Any
-    method: Literal["network", "lbs", "simulate"]
+    method: Literal["network", "guided", "lbs", "simulate"]
     inference: Inference
     simulation: Simulation
     frames: int | None
@@ -281,8 +281,12 @@ def _check_method(command: Dress) -> None:
         raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
     check_simulates(command.method, command.simulation, command.outfit)
     for flag in changed(command.inference):
-        if command.method != "network" and flag != "--collisions":
-            raise PhysXNetError(f"{flag} is for networks: --method {command.method} has none.")
+        if command.method == "guided" and flag in ("--weights", "--tta"):
+            continue
+        if command.method == "guided" or (command.method != "network" and flag != "--collisions"):
+            raise PhysXNetError(
+                f"{flag} is for networks alone: leave it out with --method {command.method}."
+            )
 
 
 def _print_end(

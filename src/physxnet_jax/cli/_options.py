@@ -80,6 +80,8 @@ class SimulationOptions(EffectOptions):
     engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
     """bdf2: implicit, second order. blender, newton: external processes (PHYSXNET_BLENDER,
     PHYSXNET_NEWTON)."""
+    substeps: int | None = None
+    """Steps a frame at 30 frames per second, in place of --accuracy; 8 with --method guided."""
     refine: float | None = None
     """Split longer edges of the garments while they are simulated [m]; the result is on the
     files' own vertices."""
@@ -238,5 +240,13 @@ def check_simulates(method: str, simulation: SimulationOptions, outfit: Outfit) 
     if method == "simulate":
         return
     for flag in changed(simulation):
-        raise PhysXNetError(f"{flag} is an option of the simulator: add --method simulate.")
-    check_one_fabric(outfit, "Add --method simulate, or leave it out.")
+        if method != "guided":
+            raise PhysXNetError(
+                f"{flag} is an option of the simulator: add --method guided or simulate."
+            )
+        if flag in ("--accuracy", "--engine", "--refine"):
+            raise PhysXNetError(
+                f"{flag} is for whole simulations: use --substeps, or --method simulate."
+            )
+    if method != "guided":
+        check_one_fabric(outfit, "Add --method guided or simulate, or leave it out.")

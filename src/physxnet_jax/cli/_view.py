@@ -23,9 +23,10 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         console: Where to print.
         over: Event that closes the viewer.
     """
-    if command.live and (command.html is not None or command.method != "network"):
+    if command.live and (command.html is not None or command.method not in ("network", "guided")):
         raise PhysXNetError(
-            "--live runs the network while the page is open: leave out --html and --method."
+            "--live computes frames while the page is open: leave out --html, and --method other"
+            " than network or guided."
         )
     if command.compare and command.method == "simulate":
         raise PhysXNetError("--compare is for a --method other than simulate; leave it out.")

@@ -14,7 +14,12 @@ from ._clothe import (
     clothe_step as clothe_step,
     init_stream as init_stream,
 )
-from ._dress import METHODS as METHODS, DressedClip as DressedClip, dress as dress
+from ._dress import (
+    INFERENCE_STAGES as INFERENCE_STAGES,
+    METHODS as METHODS,
+    DressedClip as DressedClip,
+    dress as dress,
+)
 from ._dresser import (
     Dresser as Dresser,
     Precision as Precision,

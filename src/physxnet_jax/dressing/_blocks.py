@@ -13,6 +13,7 @@ from ..body import Body
 from ..geometry import map_frames
 from ..motion import BLOCK, Motion, clip_transforms, history_transforms, padded_block
 from ._dresser import Dresser
+from ._guided import init_guided
 from ._pipeline import infer_block
 from .postprocess import BodyCollider, Layer, resolve_layers, skin_clearance
 
@@ -88,10 +89,15 @@ def infer_clip(dresser: Dresser, clip: PosedClip) -> Iterator[Block]:
         before = history_transforms(dresser.body, dresser.rest, clip.motion, history, clip.past)
         r, t = (np.concatenate(pair) for pair in zip(before, (r, t), strict=True))
     names = [w.name for w in dresser.worn]
+    state = None
+    if dresser.guided is not None:
+        state = init_guided(
+            dresser.guided, jnp.asarray(r[history - 1]), jnp.asarray(t[history - 1])
+        )
     for start in range(0, clip.num_frames, BLOCK):
         start_time = time.perf_counter()
         padded = (jnp.asarray(padded_block(x, start + history, history)) for x in (r, t))
-        out = infer_block(dresser, *padded, clip.motion.fps)
+        *out, state = infer_block(dresser, *padded, clip.motion.fps, state)
         count = min(BLOCK, clip.num_frames - start)
         raw, cloth = (
             {n: np.asarray(x)[:count] for n, x in zip(names, part, strict=True)} for part in out

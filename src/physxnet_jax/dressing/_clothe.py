@@ -13,6 +13,7 @@ from ..models import apply_sampled_offsets, normalise, point_features, predict_s
 from ..motion import extrapolate_history
 from ..typing import pytree
 from ._dresser import Dresser
+from ._guided import GuidedState, advance_guided, init_guided
 from ._pipeline import bound, infer, limit, predict_cloth, resolve
 from .postprocess import Cloth
 
@@ -57,9 +58,11 @@ class Stream:
     Attributes:
         points: Skinned texel points of the last `Dresser.history_length` frames [m],
             oldest first, shape [history, texels, 3]; None for skinning alone.
+        guided: Simulated cloth of the last frame; None if it isn't simulated.
     """
 
     points: Float[Array, "history texels 3"] | None
+    guided: GuidedState | None = None
 
 
 def _make_clothed(dresser: Dresser, cloth: tuple[Array, ...]) -> Clothed:
@@ -153,13 +156,10 @@ def init_stream(
         return Stream(points=None)
     texels = dresser.predictor.texel_points
     history = extrapolate_history(rotations, root, dresser.history_length)
-
-    def points(q: Array, p: Array) -> Array:
-        return skin_points(
-            texels.rest, texels.weights, *dresser.body.transforms(dresser.rest, q, p)
-        )[0]
-
-    return Stream(points=jax.vmap(points)(*history))
+    r, t = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*history)
+    points = jax.vmap(lambda a, b: skin_points(texels.rest, texels.weights, a, b)[0])(r, t)
+    scene = dresser.guided
+    return Stream(points=points, guided=None if scene is None else init_guided(scene, r[-1], t[-1]))
 
 
 def clothe_step(
@@ -193,6 +193,10 @@ def clothe_step(
     _check_pose(dresser.body, rotations, root, ())
     r, t = dresser.body.transforms(dresser.rest, rotations, root)
     stream, cloth = _predict_step(dresser, stream, r, t, fps)
+    if dresser.guided is not None and stream.guided is not None:
+        one = tuple(x[0] for x in cloth)
+        guided, one = advance_guided(dresser.guided, dresser.worn, stream.guided, one, r, t, fps)
+        return dataclasses.replace(stream, guided=guided), _make_clothed(dresser, one)
     cloth = limit(dresser, cloth, r[None], t[None])
     cloth = resolve(dresser, cloth, r[None], t[None])
     return stream, _make_clothed(dresser, tuple(x[0] for x in cloth))
@@ -220,4 +224,4 @@ def _predict_step(
         apply_sampled_offsets(w, rotations, translations, offsets[0], family)[None]
         for w, offsets in zip(worn, sampled, strict=True)
     )
-    return Stream(points=window[1:]), tuple(cloth)
+    return dataclasses.replace(stream, points=window[1:]), tuple(cloth)

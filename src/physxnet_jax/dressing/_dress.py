@@ -30,8 +30,10 @@ from ._simulate import EXTERNAL_ENGINES, Simulation, build_scene, run_simulation
 from ._stages import Stage, timed
 from .postprocess import make_colliders
 
-Method = Literal["network", "lbs", "simulate"]
-METHODS: tuple[Method, ...] = ("network", "lbs", "simulate")
+Method = Literal["network", "guided", "lbs", "simulate"]
+METHODS: tuple[Method, ...] = ("network", "guided", "lbs", "simulate")
+INFERENCE_STAGES = ("skinning", "network", "guided simulation")
+"""Names of the stages in which cloth is inferred."""
 Progress = Callable[[str, int, int], None]
 
 
@@ -112,10 +114,11 @@ def dress(
             defines body, shape and frame rate.
         wear: Garments, garment files or template names, with options as in
             ``coat.obj:as=top,fabric=wool`` (see `Wear`).
-        method: ``network``, ``lbs`` (skinning alone) or ``simulate`` (the cloth simulator).
+        method: ``network``, ``guided`` (a few substeps of simulation drawn to it), ``lbs``
+            (skinning alone) or ``simulate`` (the cloth simulator).
         inference: Weights and post-processing of ``network`` and ``lbs``; ``collisions`` also
             apply to cloth simulated on a character.
-        simulation: Options of ``simulate``.
+        simulation: Options of ``simulate``, and effects and substeps of ``guided``.
         fps: Frames per second of the result.
         start: Start time within the motion [s].
         frames: Keep only this many frames.
@@ -123,7 +126,7 @@ def dress(
         shape: Shape parameters; the default shape if omitted.
         include_body: Whether the result contains the body's mesh.
         progress: Called with the stage, the frames done and the total number of frames.
-        on_block: Called with each finished block of ``network`` and ``lbs``.
+        on_block: Called with each finished block of all methods but ``simulate``.
 
     Returns:
         Animated meshes, with the time of each stage.
@@ -143,7 +146,7 @@ def dress(
     clear_caches_if_full()
     person = _load_person(motion, body, shape, fps, start, frames, stages)
     garments, notes = _load_garments(wear, person, method, stages)
-    dresser = _make_dresser(garments, person, method, inference, stages)
+    dresser = _make_dresser(garments, person, method, inference, simulation, stages)
     if method == "simulate":
         cloth = _simulate_cloth(garments, person, simulation, stages, progress)
     else:
@@ -220,17 +223,19 @@ def _make_dresser(
     person: _Person,
     method: Method,
     inference: Inference,
+    simulation: Simulation,
     stages: list[Stage],
 ) -> Dresser:
-    if method == "network" and not isinstance(inference.weights, Predictor):
+    if method in ("network", "guided") and not isinstance(inference.weights, Predictor):
         with timed(stages, "weights"):
             weights = load_predictor(inference.weights)
             inference = dataclasses.replace(inference, weights=weights)
     with timed(stages, "binding"):
         return dress_garments(
             garments,
-            method="network" if method == "network" else "lbs",
+            method="lbs" if method == "simulate" else method,
             inference=inference,
+            simulation=simulation,
             body=person.body,
             shape=person.shape,
         )
@@ -261,7 +266,8 @@ def _infer_cloth(
     progress: Progress | None,
     on_block: Callable[[Block], None] | None,
 ) -> _Cloth:
-    name = "skinning" if dresser.predictor is None else "network"
+    kind = 0 if dresser.predictor is None else 1 if dresser.guided is None else 2
+    name = INFERENCE_STAGES[kind]
     blocks: list[Block] = []
     for block in infer_clip(dresser, clip):
         blocks.append(block)

@@ -20,8 +20,10 @@ from ..models import (
 )
 from ..typing import pytree
 from ..uv import bind, condition_maps
+from ._guided import GuidedScene, prepare_guided
 from ._inference import Inference
 from ._meshes import Wear, resolve_garments
+from ._simulate import Simulation
 from .postprocess import (
     BodyCollider,
     Layer,
@@ -35,7 +37,7 @@ from .postprocess import (
 )
 
 Precision = Literal["float32", "bfloat16"]
-Predicted = Literal["network", "lbs"]
+Predicted = Literal["network", "guided", "lbs"]
 
 
 @pytree
@@ -52,6 +54,7 @@ class Dresser:
         colliders: The skin near each garment; None if collisions aren't resolved.
         layers: Pairs of garments whose order is enforced; None if collisions aren't resolved.
         garments: The garments on the default shape, with their meshes.
+        guided: What simulates the garments, drawn to the prediction; None if it is the result.
         notes: Remarks on garment files. They aren't part of the pytree: a dresser that a
             transformed function returns has none.
     """
@@ -64,6 +67,7 @@ class Dresser:
     colliders: tuple[BodyCollider, ...] | None
     layers: tuple[Layer, ...] | None
     garments: tuple[Garment, ...]
+    guided: GuidedScene | None = None
     notes: tuple[str, ...] = dataclasses.field(default=(), metadata={"drop": True})
 
     @property
@@ -88,6 +92,7 @@ def make_dresser(
     *,
     method: Predicted = "network",
     inference: Inference | None = None,
+    simulation: Simulation | None = None,
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
     precision: Precision = "float32",
@@ -97,8 +102,11 @@ def make_dresser(
     Args:
         wear: Garments, garment files or template names. Tops are worn over dresses, dresses
             over trousers; of garments of one type later ones are outer.
-        method: ``network``, or ``lbs`` for skinning alone (never strain limited).
-        inference: Weights and post-processing; the defaults of `Inference` if omitted.
+        method: ``network``; ``guided`` for a few substeps of simulation drawn to it; or ``lbs`` for
+            skinning alone (never strain limited).
+        inference: Weights and post-processing, which ``guided`` leaves to the simulation; the
+            defaults of `Inference` if omitted.
+        simulation: Effects and ``substeps`` of ``guided``; its engine is ``xpbd``.
         body: The body; the built-in one by default.
         shape: Shape parameters; the default shape if omitted.
         precision: Precision of the network's arithmetic; everything else stays float32.
@@ -120,6 +128,7 @@ def make_dresser(
         notes,
         method=method,
         inference=inference,
+        simulation=simulation,
         body=body,
         shape=shape,
         precision=precision,
@@ -133,6 +142,7 @@ def dress_garments(
     *,
     method: Predicted = "network",
     inference: Inference | None = None,
+    simulation: Simulation | None = None,
     body: Body,
     shape: Float[Array, " shapes"] | None = None,
     precision: Precision = "float32",
@@ -148,7 +158,12 @@ def dress_garments(
         predictor = with_body(_predictor(inference), body, rest)
         predictor = at_precision(predictor, precision)
         worn = tuple(bind_to_predictor(predictor, body, rest, g) for g in garments)
-    outfit = Outfit(body, rest, worn, tuple(garments))
+    outfit, guided = Outfit(body, rest, worn, tuple(garments)), None
+    if method == "guided":
+        # The simulation has strain, contact and layers of its own.
+        inference = dataclasses.replace(inference, strain_iterations=0, collisions=False)
+        simulation = Simulation() if simulation is None else simulation
+        guided = prepare_guided(garments, body, shape, simulation)
     return Dresser(
         body=body,
         rest=rest,
@@ -158,6 +173,7 @@ def dress_garments(
         colliders=prepare_collisions(outfit, inference),
         layers=prepare_layers(outfit, inference),
         garments=tuple(garments),
+        guided=guided,
         notes=notes,
     )
 
@@ -237,9 +253,9 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
         The dresser for that shape.
 
     Raises:
-        ValueError: The number of parameters is wrong, or a network of the ``paper`` family
-            predicts a dress: its offsets start from a body with joined legs, so use
-            `make_dresser` with the shape instead.
+        ValueError: The number of parameters is wrong; or the cloth is simulated, or a network of
+            the ``paper`` family predicts a dress, whose offsets start from a body with joined
+            legs: use `make_dresser` with the shape instead.
 
     Example:
         >>> person = make_dresser(["bottom"])
@@ -247,6 +263,8 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
         >>> bool(tall.worn[0].rest[:, 1].max() > person.worn[0].rest[:, 1].max())
         True
     """
+    if dresser.guided is not None:
+        raise ValueError("guided simulation: use make_dresser(..., shape=shape).")
     body, predictor = dresser.body, dresser.predictor
     rest = body.rest_vertices(shape)
     worn: tuple[SkinnedGarment, ...] = tuple(

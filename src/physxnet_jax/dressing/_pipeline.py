@@ -9,6 +9,7 @@ from jaxtyping import Array, Float
 from ..garment import skin_garment
 from ..models import BoundGarment, dress_frames
 from ._dresser import Dresser
+from ._guided import GuidedState, Posed, advance_guided, init_guided
 from .postprocess import Cloth, apply_collisions, apply_layers, apply_strain
 
 
@@ -63,7 +64,8 @@ def infer(
     rotations: Float[Array, "padded joints 3 3"],
     translations: Float[Array, "padded joints 3"],
     fps: float,
-) -> tuple[Cloth, Cloth]:
+    state: GuidedState | None = None,
+) -> tuple[Cloth, Cloth, GuidedState | None]:
     """Computes garments in successive frames; pure, jit-able, differentiable.
 
     Args:
@@ -72,14 +74,27 @@ def infer(
             the first one requested.
         translations: World translations of joints in the same frames [m].
         fps: Frames per second.
+        state: Simulated cloth in the frame before, for a dresser that simulates; if None, it starts
+            as predicted.
 
     Returns:
-        Garments before collision resolution, and the result [m].
+        Garments before collision resolution, the result [m], and simulated cloth in the last frame.
     """
     first = dresser.history_length
     r, t = rotations[first:], translations[first:]
-    raw = limit(dresser, predict_cloth(dresser, rotations, translations, fps), r, t)
-    return raw, resolve(dresser, raw, r, t)
+    predicted = predict_cloth(dresser, rotations, translations, fps)
+    if dresser.guided is None:
+        raw = limit(dresser, predicted, r, t)
+        return raw, resolve(dresser, raw, r, t), None
+    scene, worn = dresser.guided, dresser.worn
+    if state is None:
+        state = init_guided(scene, rotations[first - 1], translations[first - 1])
+
+    def step(s: GuidedState, frame: tuple[Posed, Array, Array]) -> tuple[GuidedState, Posed]:
+        return advance_guided(scene, worn, s, *frame, fps)
+
+    state, cloth = jax.lax.scan(jax.checkpoint(step), state, (predicted, r, t))
+    return cloth, cloth, state
 
 
 @functools.partial(jax.jit, static_argnames="fps")
@@ -88,6 +103,7 @@ def infer_block(
     rotations: Float[Array, "padded joints 3 3"],
     translations: Float[Array, "padded joints 3"],
     fps: float,
-) -> tuple[Cloth, Cloth]:
+    state: GuidedState | None = None,
+) -> tuple[Cloth, Cloth, GuidedState | None]:
     """`infer`, compiled once per block size."""
-    return infer(dresser, jnp.asarray(rotations), jnp.asarray(translations), fps)
+    return infer(dresser, jnp.asarray(rotations), jnp.asarray(translations), fps, state)

@@ -63,8 +63,10 @@ from ._motion_metrics import (
     acceleration_error as acceleration_error,
     area_strain as area_strain,
     dihedral_angles as dihedral_angles,
+    fold_spectrum as fold_spectrum,
     fold_strength as fold_strength,
     jitter as jitter,
+    spectrum_distance as spectrum_distance,
     wrinkle_error as wrinkle_error,
 )
 from ._network_bench import (

@@ -22,16 +22,20 @@ from ._motion_metrics import (
     angle_strength,
     area_strain,
     dihedral_angles,
+    fold_spectrum,
     jitter,
+    spectrum_distance,
 )
 from ._penetration import penetration
 from ._saved_rows import DIGITS
 from ._strain import edge_strain
+from ._surface_faults import surface_faults
 
 # Resolution of the maps for texel errors, whatever the network's resolution.
 _RESOLUTION = 128
 # Penetration is measured in every fifth frame: it takes longer than all other metrics.
 _PENETRATION_STRIDE = 5
+_LOOK_STRIDE = 15
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,6 +69,11 @@ class ActionError:
         ms_per_frame: Warm time from joint rotations to this template's vertices [ms].
         fold_strength: Relative to the reference, see the function of that name [1].
         strain_p99_reference: ``strain_p99`` of the reference [1].
+        spectrum: Distance to the reference of `fold_spectrum` [1].
+        tension_p99: 99th percentile of the strain of edges, negative where they are shorter [1].
+        tension_p99_reference: ``tension_p99`` of the reference [1].
+        visible_skin: Share of pixels that show skin which came through cloth (every fifteenth
+            frame), see `surface_faults`.
         data: Checksum of the reference's offsets; empty if it wasn't recorded.
         weights: Checksum of the network's weights, or of the training data of `nearest` and
             `mlp`; empty if it wasn't recorded.
@@ -95,6 +104,10 @@ class ActionError:
     ms_per_frame: float
     fold_strength: float = math.nan
     strain_p99_reference: float = math.nan
+    spectrum: float = math.nan
+    tension_p99: float = math.nan
+    tension_p99_reference: float = math.nan
+    visible_skin: float = math.nan
     data: str = ""
     weights: str = ""
 
@@ -176,6 +189,7 @@ class _ReferenceTables:
 
     def __init__(self) -> None:
         self._tables: dict[Clothing, tuple[Assembly, Transference]] = {}
+        self._spectra: dict[tuple[str, str], np.ndarray] = {}
 
     def tables(self, worn: Clothing) -> tuple[Assembly, Transference]:
         if worn not in self._tables:
@@ -221,7 +235,12 @@ class _ReferenceTables:
         inside = penetration(assembly, motion, shown, frames=sampled, bare_skin=False)
         free = inside.cloth_inside & ~inside.pinched
         faces = np.asarray(assembly.faces)
-        strain = np.abs(edge_strain(assembly, x))
+        strain, wanted = (edge_strain(assembly, p) for p in (x, y))
+        looked = np.flatnonzero(finite)[::_LOOK_STRIDE]
+        spectrum = fold_spectrum(assembly.rest, faces, x[::_LOOK_STRIDE])
+        if (sequence.name, name) not in self._spectra:
+            shape = fold_spectrum(assembly.rest, faces, reference[::_LOOK_STRIDE])
+            self._spectra[sequence.name, name] = shape
         angles = [dihedral_angles(faces, p) for p in (x, y)]
         values |= {
             "mse_texels_mm2": texels,
@@ -234,13 +253,17 @@ class _ReferenceTables:
             "penetration_share": float(free.mean()),
             "pinched_share": float((inside.cloth_inside & inside.pinched).mean()),
             "penetration_mm": 1e3 * float(np.where(free, inside.depth, 0.0).max()),
-            "strain_p99": float(np.quantile(strain, 0.99)),
+            "strain_p99": float(np.quantile(np.abs(strain), 0.99)),
             "area_strain_p99": float(
                 np.quantile(np.abs(area_strain(assembly.rest, faces, x)), 0.99)
             ),
             "wrinkle_deg": angle_error(*angles),
             "fold_strength": angle_strength(angles[0]) / max(angle_strength(angles[1]), 1e-6),
-            "strain_p99_reference": float(np.quantile(np.abs(edge_strain(assembly, y)), 0.99)),
+            "strain_p99_reference": float(np.quantile(np.abs(wanted), 0.99)),
+            "spectrum": spectrum_distance(spectrum, self._spectra[sequence.name, name]),
+            "tension_p99": float(np.quantile(strain, 0.99)),
+            "tension_p99_reference": float(np.quantile(wanted, 0.99)),
+            "visible_skin": surface_faults(assembly, motion, shown, frames=looked).visible_skin,
         }
         # Accelerations across a missing frame are undefined.
         if finite.all():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pathlib
+import re
 from collections.abc import Sequence
 
 from ..dressing import EXTERNAL_ENGINES, Inference
@@ -9,14 +10,17 @@ from ..errors import PhysXNetError
 from ..garment import Template
 from ..models import load_predictor
 from ..simulation import PRESETS
-from ._methods import PERTURBATION, Method, Simulator, external_engine, network, skinning
+from ._methods import PERTURBATION, Guided, Method, Simulator, external_engine, network, skinning
 
 MIRROR, RELAX, PUSH = "+mirror", "+relax", "+push"
 """Suffixes of rows: test-time augmentation, strain limiting, collision resolution."""
+_SIMULATED = re.compile(r"\+(guided|unguided)(\d*)$")
 
 
 def parse_method(name: str) -> Inference:
     """The options of a network's row: ``WEIGHTS[+mirror][+relax][+push]``.
+
+    What follows ``+guided`` or ``+unguided`` isn't the network's and is left out.
 
     Args:
         name: Name or folder of weights or of a run, with its suffixes.
@@ -25,7 +29,7 @@ def parse_method(name: str) -> Inference:
         >>> parse_method("nano+mirror+push")
         Inference(weights='nano', tta=True, strain_iterations=0, collisions=True)
     """
-    found = []
+    found, name = [], _SIMULATED.sub("", name)
     for suffix in (PUSH, RELAX, MIRROR):
         if name.endswith(suffix):
             name = name.removesuffix(suffix)
@@ -60,7 +64,8 @@ def method_by_name(name: str, templates: Sequence[Template] = ()) -> Method:
     """A method by the name of its row.
 
     ``perturbed`` is the simulator with a root perturbed by `PERTURBATION`. Its distance to the
-    unperturbed run is the smallest meaningful error.
+    unperturbed run is the smallest meaningful error. ``+guided16`` after a network is a guided
+    simulation with 16 substeps, ``+unguided16`` the same without a guide.
 
     Args:
         name: ``lbs``, ``perturbed``, an accuracy of the simulator, an external engine, or a
@@ -87,4 +92,9 @@ def method_by_name(name: str, templates: Sequence[Template] = ()) -> Method:
         raise PhysXNetError(
             f"{name} has no decoder for {', '.join(sorted(missing))}; leave them out."
         )
-    return network(dataclasses.replace(inference, weights=predictor))
+    loaded = dataclasses.replace(inference, weights=predictor)
+    simulated = _SIMULATED.search(name)
+    if simulated is None:
+        return network(loaded)
+    kind, substeps = simulated.groups()
+    return Guided(loaded, int(substeps) if substeps else None, free=kind == "unguided")

@@ -18,8 +18,11 @@ from ..dressing import (
     Dresser,
     Inference,
     Precision,
+    Simulation,
     infer_block,
+    infer_clip,
     make_dresser,
+    pose_clip,
 )
 from ..geometry import polar_rotation
 from ..models import Predictor, load_predictor
@@ -32,6 +35,10 @@ from ..simulation import (
     simulate_batch,
     standard_effects,
 )
+from ..simulation.effects import Guide
+
+# Time constant of a guide that doesn't pull [s].
+_NEVER = 1e6
 
 # Perturbation of the body's root that shows how far simulations diverge [m].
 PERTURBATION = 1e-6
@@ -152,6 +159,43 @@ def network(inference: Inference, precision: Precision = "float32") -> Blockwise
         )
 
     return Blockwise(_infer, wear, predictor.config.inputs.window - 1)
+
+
+class Guided:
+    """Guided simulation, one garment at a time.
+
+    Args:
+        inference: Weights of the network that guides.
+        substeps: Substeps a frame at 30 frames per second; the default if None.
+        free: Not drawn to the network, which only starts the cloth: what the guide is worth.
+    """
+
+    def __init__(
+        self, inference: Inference, substeps: int | None = None, *, free: bool = False
+    ) -> None:
+        self._inference, self._substeps, self._free = inference, substeps, free
+        self._dressers: dict[Clothing, Dresser] = {}
+
+    def __call__(self, motion: Motion, name: Clothing) -> Prediction:
+        """The cloth in every frame."""
+        if name not in self._dressers:
+            garment = garment_of(name)
+            effects = (*standard_effects((garment,)), Guide(time_constant=_NEVER))
+            self._dressers[name] = make_dresser(
+                [garment],
+                method="guided",
+                shape=shape_of(name),
+                inference=self._inference,
+                simulation=Simulation(
+                    substeps=self._substeps, effects=effects if self._free else None
+                ),
+            )
+        dresser = self._dressers[name]
+        clip = pose_clip(dresser.body, dresser.rest, motion)
+        blocks = list(infer_clip(dresser, clip))
+        cloth = np.concatenate([b.positions[dresser.worn[0].name] for b in blocks])
+        times = [b.milliseconds / BLOCK for b in blocks]
+        return Prediction(cloth, float(np.median(times[1:] if len(times) > 1 else times)))
 
 
 def scene_of(name: Clothing) -> Scene:

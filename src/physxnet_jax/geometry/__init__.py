@@ -17,6 +17,10 @@ from ._edge_constraints import (
 )
 from ._frames import map_frames as map_frames
 from ._intersect import self_intersections as self_intersections
+from ._laplacian import (
+    cotangent_laplacian as cotangent_laplacian,
+    mesh_laplacian as mesh_laplacian,
+)
 from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
 from ._normals import vertex_normals as vertex_normals
 from ._padding import pad_rows as pad_rows, padded_rows as padded_rows

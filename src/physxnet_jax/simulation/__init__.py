@@ -1,6 +1,11 @@
 """The cloth simulator: scenes of effects, solvers and rollouts, independent of UV maps."""
 
-from ._advance import advance as advance, start_state as start_state
+from ._advance import (
+    advance as advance,
+    advance_frame as advance_frame,
+    skin_effects as skin_effects,
+    start_state as start_state,
+)
 from ._assembly import Assembly as Assembly
 from ._diagnostics import OFF as OFF, Rollout as Rollout, Status as Status
 from ._effect import (
@@ -29,7 +34,7 @@ from ._scene import (
 )
 from ._slip import slipped as slipped
 from ._solver import Solver as Solver
-from ._state import State as State
+from ._state import State as State, System as System
 from ._static_body import settle_on_static_body as settle_on_static_body
 from ._verlet import Verlet as Verlet
 from ._xpbd import XPBD as XPBD

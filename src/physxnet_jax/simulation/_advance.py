@@ -76,71 +76,30 @@ def advance(
     Returns:
         The last state, positions of frames 1 and later, and diagnostics of each frame.
     """
-    count = solver.substeps // solver.contact_updates
     h = 1.0 / (fps * solver.substeps)
     system = solver.at_step(system, h)
     effects = system.effects
-    length = count * h
 
     def skin(q: Array, p: Array) -> tuple[PosedPoints | None, ...]:
-        return tuple(
-            None
-            if e.skinned_points is None
-            else place(system.body, system.rest, e.skinned_points, q, p)
-            for e in effects
-        )
-
-    def interval(carry: tuple, k: Array) -> tuple[tuple, None]:
-        state, _, _, before, after, start_time = carry
-        start = jax.tree.map(lambda a, b: a + (k / solver.contact_updates) * (b - a), before, after)
-        end = jax.tree.map(
-            lambda a, b: a + ((k + 1) / solver.contact_updates) * (b - a), before, after
-        )
-        base = state.position
-        clock = Clock(start_time + k * length, length)
-        contexts = tuple(
-            e.begin(base, s, t, clock, m)
-            for e, s, t, m in zip(effects, start, end, state.effect_state, strict=True)
-        )
-        effect_state = tuple(e.update_state(c) for e, c in zip(effects, contexts, strict=True))
-        d, v, solver_state = solver.advance_interval(
-            system, contexts, state.velocity, state.solver_state, h, count
-        )
-        return (
-            State(base + d, v, solver_state, effect_state),
-            d,
-            contexts,
-            before,
-            after,
-            start_time,
-        ), None
+        transforms = jax.vmap(lambda a, b: system.body.transforms(system.rest, a, b))(q, p)
+        return skin_effects(system, *transforms)
 
     def frame(carry: tuple, pose: tuple[Array, ...]) -> tuple[tuple, tuple]:
-        state, before, start_time, *drawn = carry
+        state, before, now, *drawn = carry
         after = skin(*pose[:2])
-        if guide is not None:
-            pair = (drawn[0], pose[2])
-            received = tuple(
-                e.receive(s, pair, start_time, 1.0 / fps)
-                for e, s in zip(effects, state.effect_state, strict=True)
-            )
-            state = dataclasses.replace(state, effect_state=received)
-        # The loop's carry needs the contexts' shapes; the first interval fills them.
-        shapes = jax.eval_shape(
-            lambda x, at, effect_state: tuple(
-                e.begin(x, s, s, Clock(start_time, length), m)
-                for e, s, m in zip(effects, at, effect_state, strict=True)
-            ),
-            state.position,
+        pair = (drawn[0], pose[2]) if drawn else None
+        state, info = advance_frame(
+            system,
+            state,
             before,
-            state.effect_state,
+            after,
+            solver=solver,
+            fps=fps,
+            time=now,
+            guide=pair,
+            energies=energies,
         )
-        contexts = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
-        start = (state, jnp.zeros_like(state.position), contexts, before, after, start_time)
-        steps = jnp.arange(solver.contact_updates, dtype=state.position.dtype)
-        (state, d, contexts, _, _, _), _ = jax.lax.scan(interval, start, steps)
-        info = _diagnose(system, solver, state, d, contexts, h, energies)
-        return (state, after, start_time + 1.0 / fps, *pose[2:]), (state.position, info)
+        return (state, after, now + 1.0 / fps, *pose[2:]), (state.position, info)
 
     if state.effect_state is None:
         effect_state = tuple(e.init_state(state.position.shape[2]) for e in effects)
@@ -158,6 +117,96 @@ def advance(
         (rotations[1:], root[1:], *later),
     )
     return state, positions, diagnostics
+
+
+def skin_effects(
+    system: System,
+    rotations: Float[Array, "batch joints 3 3"],
+    translations: Float[Array, "batch joints 3"],
+) -> tuple[PosedPoints | None, ...]:
+    """What each effect needs of the skin in a pose, from world transforms of the joints."""
+    return tuple(
+        None if e.skinned_points is None else place(e.skinned_points, rotations, translations)
+        for e in system.effects
+    )
+
+
+def advance_frame(
+    system: System,
+    state: State,
+    before: tuple[PosedPoints | None, ...],
+    after: tuple[PosedPoints | None, ...],
+    *,
+    solver: Solver,
+    fps: float,
+    time: Float[Array, ""],
+    guide: tuple[Array, Array] | None = None,
+    diagnose: bool = True,
+    energies: bool = False,
+) -> tuple[State, dict[str, Array]]:
+    """Advances the cloth by one frame; `advance` for those who have the skin already.
+
+    Args:
+        system: The scene, with the tables of `Solver.at_step` for this length of substeps.
+        state: State at the start, from `start_state`.
+        before: `skin_effects` at the start.
+        after: `skin_effects` at the end.
+        solver: Solver of the cloth.
+        fps: Frames per second.
+        time: Time at the start [s].
+        guide: Where an effect such as `Guide` draws the cloth to at the start and at the end.
+        diagnose: Whether to return diagnostics.
+        energies: Also return the energy of each effect.
+    """
+    count = solver.substeps // solver.contact_updates
+    h = 1.0 / (fps * solver.substeps)
+    length, effects = count * h, system.effects
+
+    def interval(carry: tuple, k: Array) -> tuple[tuple, None]:
+        state, _, _ = carry
+        start = jax.tree.map(lambda a, b: a + (k / solver.contact_updates) * (b - a), before, after)
+        end = jax.tree.map(
+            lambda a, b: a + ((k + 1) / solver.contact_updates) * (b - a), before, after
+        )
+        base = state.position
+        clock = Clock(time + k * length, length)
+        contexts = tuple(
+            e.begin(base, s, t, clock, m)
+            for e, s, t, m in zip(effects, start, end, state.effect_state, strict=True)
+        )
+        effect_state = tuple(e.update_state(c) for e, c in zip(effects, contexts, strict=True))
+        d, v, solver_state = solver.advance_interval(
+            system, contexts, state.velocity, state.solver_state, h, count
+        )
+        return (
+            State(base + d, v, solver_state, effect_state),
+            d,
+            contexts,
+        ), None
+
+    if guide is not None:
+        received = tuple(
+            e.receive(s, guide, time, 1.0 / fps)
+            for e, s in zip(effects, state.effect_state, strict=True)
+        )
+        state = dataclasses.replace(state, effect_state=received)
+    # The loop's carry needs the contexts' shapes; the first interval fills them.
+    shapes = jax.eval_shape(
+        lambda x, at, effect_state: tuple(
+            e.begin(x, s, s, Clock(time, length), m)
+            for e, s, m in zip(effects, at, effect_state, strict=True)
+        ),
+        state.position,
+        before,
+        state.effect_state,
+    )
+    contexts = jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes)
+    first = (state, jnp.zeros_like(state.position), contexts)
+    steps = jnp.arange(solver.contact_updates, dtype=state.position.dtype)
+    (state, d, contexts), _ = jax.lax.scan(interval, first, steps)
+    if not diagnose:
+        return state, {}
+    return state, _diagnose(system, solver, state, d, contexts, h, energies)
 
 
 def advance_on(

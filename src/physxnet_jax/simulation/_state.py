@@ -102,20 +102,17 @@ def _check_factor(name: str, factor: Any) -> None:
 
 
 def place(
-    body: Body,
-    rest: Float[Array, "all 3"],
     skinned_points: SkinnedPoints,
-    rotations: Float[Array, "batch joints 4"],
-    root: Float[Array, "batch 3"],
+    rotations: Float[Array, "batch joints 3 3"],
+    translations: Float[Array, "batch joints 3"],
 ) -> PosedPoints:
-    """Skins points with the body in a batch of poses."""
+    """Skins points with the body in a batch of poses, from world transforms of its joints."""
 
-    def one(q: Array, p: Array) -> tuple[Array, Array]:
-        world, shift = body.transforms(rest, q, p)
+    def one(world: Array, shift: Array) -> tuple[Array, Array]:
         blend = blend_rotations(skinned_points.weights, world)
         points = jnp.einsum("vab,vb->va", blend, skinned_points.rest, precision=_EXACT)
         points = points + jnp.matmul(skinned_points.weights, shift, precision=_EXACT)
         return points, jnp.einsum("vab,vb->va", blend, skinned_points.normals, precision=_EXACT)
 
-    points, normals = jax.vmap(one, out_axes=2)(rotations, root)
+    points, normals = jax.vmap(one, out_axes=2)(rotations, translations)
     return PosedPoints(points, normals)

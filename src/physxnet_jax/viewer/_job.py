@@ -14,6 +14,7 @@ import numpy as np
 from .._environment import clear_caches_if_full
 from ..body import load_body
 from ..dressing import (
+    INFERENCE_STAGES,
     Inference,
     Simulation,
     animated_meshes,
@@ -41,10 +42,10 @@ class Choice:
     Attributes:
         motion: A built-in clip or a motion file.
         wear: Templates and garment files.
-        method: ``network``, ``lbs`` or ``simulate``.
+        method: ``network``, ``guided``, ``lbs`` or ``simulate``.
         inference: Weights and post-processing.
         compare: Simulate the same clothes for comparison, and colour by the distance.
-        live: Run the network on each frame when it is shown, and report the time.
+        live: Compute each frame when it is shown, and report the time.
         shape: Shape parameters by name; none for the default shape.
         simulation: Options of the simulator. The reference is always ``standard``, on which
             the networks were trained.
@@ -138,7 +139,7 @@ def check_choice(choice: Choice) -> None:
     if choice.fabric is not None and choice.fabric not in FABRICS:
         raise PhysXNetError(f"No fabric '{choice.fabric}'; there are {', '.join(FABRICS)}.")
     _shape(choice)
-    if choice.method == "network":
+    if choice.method in ("network", "guided"):
         read_card(str(choice.inference.weights))
 
 
@@ -192,8 +193,15 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     world, shift = clip_transforms(body, rest, clip)
     summary = "\n".join(f"* {line}" for line in lines if line)
     live = None
-    if choice.live and choice.wear and choice.method == "network":
-        live = Live(clip, choice.wear, inference=choice.inference, shape=shape)
+    if choice.live and choice.wear and choice.method in ("network", "guided"):
+        live = Live(
+            clip,
+            _worn(choice),
+            method=choice.method,
+            inference=choice.inference,
+            simulation=_effects(choice),
+            shape=shape,
+        )
     return Shown(
         choice,
         garments,
@@ -214,15 +222,16 @@ def _dressed(
     """Garments by network or skinning, and lines that describe the result."""
     dressed = dress(
         clip,
-        choice.wear,
-        method="lbs" if choice.method == "lbs" else "network",
+        _worn(choice),
+        method=choice.method,  # pyright: ignore[reportArgumentType]
         inference=choice.inference,
+        simulation=_effects(choice),
         fps=choice.fps,
         shape=shape,
         include_body=False,
         progress=progress,
     )
-    stage = next(s for s in dressed.stages if s.name in ("network", "skinning"))
+    stage = next(s for s in dressed.stages if s.name in INFERENCE_STAGES)
     cost = f"first {BLOCK} frames {stage.cold_ms:.0f} ms"
     if stage.warm_ms is not None:
         cost = f"{stage.warm_ms:.1f} ms a frame ({cost})"
@@ -232,6 +241,19 @@ def _dressed(
     # Escaped, because a note may contain a file name and the page renders HTML.
     lines += [html.escape(note) for note in dressed.notes]
     return dressed.garments, lines
+
+
+def _worn(choice: Choice) -> tuple[str, ...]:
+    """What is worn, of the chosen fabric if that matters."""
+    if choice.method != "guided":
+        return choice.wear
+    return with_default_fabric(choice.wear, choice.fabric)
+
+
+def _effects(choice: Choice) -> Simulation:
+    """The options that a guided simulation has."""
+    s = choice.simulation
+    return Simulation(wind=s.wind, self_contact=s.self_contact, substeps=s.substeps)
 
 
 def _compared(
@@ -267,6 +289,8 @@ def _simulated(
 def _known_error(choice: Choice) -> str:
     """The tabulated error of this method, which doesn't depend on the clip."""
     name = "lbs" if choice.method == "lbs" else method_name(choice.inference)
+    if choice.method == "guided":
+        name = f"{choice.inference.weights}+guided"
     iterations = choice.inference.strain_iterations
     if choice.method == "network" and iterations != parse_method(name).strain_iterations:
         return ""

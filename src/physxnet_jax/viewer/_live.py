@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..dressing import Inference, clothe_step, init_stream, make_dresser
+from ..dressing import Inference, Simulation, clothe_step, init_stream, make_dresser
 from ..motion import Motion
 
 # Number of recent frames whose median time is reported.
@@ -22,12 +22,14 @@ class Live:
 
     Any frame may be requested; consecutive frames cost one step each. After a jump the
     network's window of past frames is processed first, so that the result equals that of
-    the whole clip at once.
+    the whole clip at once; simulated cloth starts there.
 
     Args:
         motion: The clip.
         wear: Templates and garment files.
+        method: ``network`` or ``guided``.
         inference: Weights and post-processing.
+        simulation: Effects of ``guided``.
         shape: Shape parameters of the body; the default shape if None.
 
     Raises:
@@ -39,11 +41,19 @@ class Live:
         motion: Motion,
         wear: tuple[str, ...],
         *,
+        method: str = "network",
         inference: Inference,
+        simulation: Simulation | None = None,
         shape: Float[Array, " shapes"] | None = None,
     ) -> None:
         self._motion = motion
-        self._dresser = make_dresser(wear, inference=inference, shape=shape)
+        self._dresser = make_dresser(
+            wear,
+            method=method,  # pyright: ignore[reportArgumentType]
+            inference=inference,
+            simulation=simulation,
+            shape=shape,
+        )
         self._step = _step(motion.fps)
         self._start = jax.jit(init_stream)
         self._times: collections.deque[float] = collections.deque(maxlen=_RECENT)

@@ -6,6 +6,8 @@ from jaxtyping import Float, Int
 from scipy.sparse.linalg import splu
 from scipy.spatial import KDTree
 
+from ...geometry import cotangent_laplacian
+
 # Cotangents are kept within these limits, so that thin triangles can't make the system indefinite.
 _COTANGENTS = (0.05, 10.0)
 
@@ -35,7 +37,8 @@ def flatten(
     """
     local, cotangents = _triangles(points, faces)
     n = len(points)
-    laplacian = _laplacian(faces, cotangents, n)
+    # A trace of the identity makes the system regular; the mean is removed afterwards.
+    laplacian = (cotangent_laplacian(faces, cotangents, n) + 1e-9 * sp.identity(n)).tocsc()
     free = np.setdiff1d(np.arange(n), [] if on_axis is None else on_axis)
     across, along = splu(laplacian[free][:, free].tocsc()), splu(laplacian)
     uv = np.array(start, dtype=np.float64)
@@ -87,19 +90,6 @@ def _triangles(
         v = local[:, (k + 2) % 3] - local[:, k]
         cotangents[:, k] = (u * v).sum(axis=1) / np.abs(u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0])
     return local, np.clip(cotangents, *_COTANGENTS)
-
-
-def _laplacian(
-    faces: Int[np.ndarray, "faces 3"], cotangents: Float[np.ndarray, "faces 3"], n: int
-) -> sp.csc_matrix:
-    i = np.concatenate([faces[:, k] for k in range(3)])
-    j = np.concatenate([faces[:, (k + 1) % 3] for k in range(3)])
-    w = np.concatenate([cotangents[:, (k + 2) % 3] for k in range(3)])
-    off = sp.coo_matrix((w, (i, j)), (n, n))
-    off = (off + off.T).tocsc()
-    degree = np.asarray(off.sum(axis=1)).ravel()
-    # A trace of the identity makes the system regular; the mean is removed afterwards.
-    return sp.csc_matrix(sp.diags(degree + 1e-9) - off)
 
 
 def nearest_triangle(

@@ -7,7 +7,7 @@ from ._damping import Damping as Damping
 from ._dihedral import Dihedral as Dihedral
 from ._elastic import Elastic as Elastic
 from ._gravity import Gravity as Gravity
-from ._guide import Guide as Guide
+from ._guide import Guide as Guide, PreparedGuide as PreparedGuide
 from ._layers import LayerContact as LayerContact
 from ._membrane import Membrane as Membrane
 from ._pin import Pin as Pin

@@ -1,0 +1,243 @@
+"""Guided simulation: a few substeps of the real mesh, drawn to what the network predicts."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ..body import Body
+from ..errors import PhysXNetError
+from ..garment import Garment, SkinnedGarment, skin_garment
+from ..simulation import (
+    PosedPoints,
+    Solver,
+    State,
+    System,
+    advance_frame,
+    make_system,
+    prepare_scene,
+    skin_effects,
+    start_state,
+)
+from ..simulation.effects import Guide, PreparedGuide
+from ..typing import pytree
+from ._simulate import Simulation, build_scene
+
+Posed = tuple[Float[Array, "_ 3"], ...]
+"""Vertices of each garment in one frame [m]."""
+
+# Substeps a frame at 30 frames per second, if none are given.
+_SUBSTEPS = 8
+# Substeps a frame at which bending needs no correction.
+_CONVERGED = 128
+# Rate at which `Dresser` prepares a scene [1/s]; others are prepared where they are asked for.
+_RATE = 30.0
+# Time constant of the guide for each substep a frame [s]: the finer, the freer.
+_TIME_CONSTANT = 0.00125
+# Distance of a patch from its prediction at which the cloth starts anew [m].
+_ASTRAY = 0.4
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GuidedScene:
+    """What simulates the garments of a dresser.
+
+    Attributes:
+        system: The scene, with tables for substeps at ``_RATE``.
+        solver: Its solver at 30 frames per second.
+        order: Place of each of the scene's garments among the dresser's.
+        parts: First vertex of each of the scene's garments, and the number of vertices.
+    """
+
+    system: System
+    solver: Solver = dataclasses.field(metadata={"static": True})
+    order: tuple[int, ...] = dataclasses.field(metadata={"static": True})
+    parts: tuple[int, ...] = dataclasses.field(metadata={"static": True})
+
+    @property
+    def guide(self) -> PreparedGuide:
+        """The effect that draws the cloth."""
+        return next(e for e in self.system.effects if isinstance(e, PreparedGuide))
+
+    def joined(self, cloth: Posed) -> Float[Array, "vertices 3 1"]:
+        """All garments in the scene's order, from those of the dresser."""
+        return jnp.concatenate([cloth[k] for k in self.order])[:, :, None]
+
+    def parted(self, position: Float[Array, "vertices 3 1"]) -> Posed:
+        """The dresser's garments, from the scene's."""
+        out = dict(zip(self.order, jnp.split(position[:, :, 0], self.parts[1:-1]), strict=True))
+        return tuple(out[k] for k in range(len(self.order)))
+
+
+@pytree
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GuidedState:
+    """The simulated cloth between two frames.
+
+    Attributes:
+        cloth: Its state.
+        skin: What the effects need of the skin, see `skin_effects`.
+        means: Where the patches were drawn to [m], shape [patches, 3, 1].
+        rotations: World rotations of joints.
+        translations: World translations of joints [m].
+        time: Time since the first frame [s].
+        ready: Whether there is cloth to go on from; else it starts as predicted.
+    """
+
+    cloth: State
+    skin: tuple[PosedPoints | None, ...]
+    means: Float[Array, "patches 3 1"]
+    rotations: Float[Array, "joints 3 3"]
+    translations: Float[Array, "joints 3"]
+    time: Float[Array, ""]
+    ready: Bool[Array, ""]
+
+
+def prepare_guided(
+    garments: list[Garment],
+    body: Body,
+    shape: Float[Array, " shapes"] | None,
+    simulation: Simulation,
+) -> GuidedScene:
+    """Prepares the simulation of garments for frames at 30 a second.
+
+    Args:
+        garments: Garments in the dresser's order.
+        body: The body.
+        shape: Its shape parameters; the default if None.
+        simulation: Effects, and ``substeps``.
+
+    Raises:
+        PhysXNetError: Options that a guided simulation hasn't.
+    """
+    for name in ("engine", "refine"):
+        given = getattr(simulation, name)
+        if given != getattr(Simulation(), name):
+            raise PhysXNetError(
+                f"{name} is {given}, but a guided simulation has substeps and effects alone."
+            )
+    substeps = simulation.substeps or _SUBSTEPS
+    solver = dataclasses.replace(simulation, substeps=substeps).solver
+    given = [e for e in simulation.effects or () if isinstance(e, Guide)]
+    guide = given or [Guide(time_constant=_TIME_CONSTANT * substeps)]
+    scene = build_scene(garments, body, shape, simulation, guide)
+    places = {id(g): k for k, g in enumerate(garments)}
+    prepared = prepare_scene(scene)
+    system = _softened(make_system(prepared, solver), _softness(substeps * _RATE))
+    return GuidedScene(
+        system=solver.at_step(system, 1.0 / (_RATE * substeps)),
+        solver=solver,
+        order=tuple(places[id(g)] for g in scene.garments),
+        parts=prepared.assembly.parts,
+    )
+
+
+def _softness(rate: float) -> float:
+    """Factor of bending for a number of substeps a second.
+
+    One sweep a substep leaves cloth too soft along its surface, but not in bending: where substeps
+    are few, the folds that it should throw are ironed out. Measured: `experiments/guided.py`.
+    """
+    return min(1.0, rate / (_RATE * _CONVERGED))
+
+
+def _softened(system: System, factor: float) -> System:
+    bends = any("bend" in e.materials for e in system.effects)
+    return system.rescaled(bend=factor) if bends else system
+
+
+def init_guided(
+    scene: GuidedScene,
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+) -> GuidedState:
+    """The state before the first frame, which starts as predicted.
+
+    Args:
+        scene: From `prepare_guided`.
+        rotations: World rotations of joints in the frame before.
+        translations: World translations of joints in the frame before [m].
+    """
+    zero = jnp.zeros((scene.parts[-1], 3, 1), jnp.float32)
+    skin = skin_effects(scene.system, rotations[None], translations[None])
+    return GuidedState(
+        cloth=start_state(scene.system, zero, solver=scene.solver, fps=_RATE),
+        skin=skin,
+        means=scene.guide.means(zero),
+        rotations=rotations,
+        translations=translations,
+        time=jnp.zeros((), jnp.float32),
+        ready=jnp.zeros((), bool),
+    )
+
+
+def advance_guided(
+    scene: GuidedScene,
+    worn: tuple[SkinnedGarment, ...],
+    state: GuidedState,
+    predicted: Posed,
+    rotations: Float[Array, "joints 3 3"],
+    translations: Float[Array, "joints 3"],
+    fps: float,
+) -> tuple[GuidedState, Posed]:
+    """Simulates the garments up to the next frame, drawn to where they are predicted.
+
+    Posed that isn't finite or that has gone astray starts anew from the prediction.
+
+    Args:
+        scene: From `prepare_guided`.
+        worn: The dresser's garments.
+        state: From `init_guided` or the frame before.
+        predicted: Predicted garments [m].
+        rotations: World rotations of joints.
+        translations: World translations of joints [m].
+        fps: Frames per second.
+    """
+    solver, system = scene.solver.at_rate(fps), scene.system
+    if fps != _RATE:
+        known, rate = (s.substeps * f for s, f in ((scene.solver, _RATE), (solver, fps)))
+        system = _softened(system, _softness(rate) / _softness(known))
+        system = solver.at_step(system, 1.0 / rate)
+    target = scene.joined(predicted)
+    means = scene.guide.means(target)
+    skin = skin_effects(system, rotations[None], translations[None])
+
+    def go(_: None) -> State:
+        return advance_frame(
+            system,
+            state.cloth,
+            state.skin,
+            skin,
+            solver=solver,
+            fps=fps,
+            time=state.time,
+            guide=(state.means, means),
+            diagnose=False,
+        )[0]
+
+    def start(_: None) -> State:
+        # As fast as the garment's skinning.
+        moved = tuple(
+            skin_garment(w, rotations, translations)
+            - skin_garment(w, state.rotations, state.translations)
+            for w in worn
+        )
+        begun = start_state(system, target, fps * scene.joined(moved), solver=solver, fps=fps)
+        # Both branches must have one type: `start_state` gives weak ones.
+        return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), begun, state.cloth)
+
+    cloth = jax.lax.cond(state.ready, go, start, None)
+    away = jnp.sum((scene.guide.means(cloth.position) - means) ** 2, axis=1)
+    new = GuidedState(
+        cloth=cloth,
+        skin=skin,
+        means=means,
+        rotations=rotations,
+        translations=translations,
+        time=state.time + 1.0 / fps,
+        # False as well where something isn't finite.
+        ready=jnp.all(away < _ASTRAY**2) & jnp.all(jnp.isfinite(cloth.velocity)),
+    )
+    return new, scene.parted(cloth.position)

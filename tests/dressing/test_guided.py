@@ -1,0 +1,178 @@
+"""Guided simulation: it starts as predicted, streams, starts anew, and obeys fabric and wind."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.dressing import (
+    Inference,
+    Simulation,
+    clothe,
+    clothe_step,
+    dress,
+    init_stream,
+    make_dresser,
+    with_shape,
+)
+from physxnet_jax.dressing._guided import _softness
+from physxnet_jax.errors import FormatError, PhysXNetError
+from physxnet_jax.motion import load_motion
+from physxnet_jax.simulation.effects import Guide
+
+NANO = Inference(weights="nano")
+FRAMES = 8
+
+
+@pytest.fixture(scope="module")
+def motion():
+    walk = load_motion("walk", fps=30.0)
+    return dataclasses.replace(walk, rotations=walk.rotations[:40], root=walk.root[:40])
+
+
+@pytest.fixture(scope="module")
+def guided():
+    return make_dresser(["bottom"], method="guided", inference=NANO)
+
+
+@functools.partial(jax.jit, static_argnames="fps")
+def cloth_of(dresser, q, p, fps=30.0):
+    return clothe(dresser, q, p, fps)
+
+
+@functools.partial(jax.jit, static_argnames="fps")
+def step(dresser, stream, q, p, fps=30.0):
+    return clothe_step(dresser, stream, q, p, fps)
+
+
+def test_the_first_frame_is_the_prediction_and_later_ones_are_not(guided, motion):
+    q, p = motion.rotations[:FRAMES], motion.root[:FRAMES]
+    bare = Inference(weights="nano", strain_iterations=0, collisions=False)
+    predicted = clothe(make_dresser(["bottom"], inference=bare), q, p, 30.0)["bottom"]
+    found = cloth_of(guided, q, p)
+    assert bool(found.ok.all())
+    gap = np.linalg.norm(found["bottom"] - predicted, axis=2).max(axis=1)
+    assert gap[0] < 1e-6 and (gap[1:] > 1e-3).all()
+    # The patches are still where they are predicted, nearly.
+    scene = guided.guided
+    means = [
+        jax.vmap(lambda x: scene.guide.means(x[:, :, None]))(x)
+        for x in (found["bottom"], predicted)
+    ]
+    away = np.linalg.norm(np.asarray(means[0] - means[1])[..., 0], axis=2)
+    assert away[-1].mean() < 0.01
+
+
+def test_a_stream_gives_the_clip(guided, motion):
+    q, p = motion.rotations[:FRAMES], motion.root[:FRAMES]
+    whole = cloth_of(guided, q, p)["bottom"]
+    stream = init_stream(guided, q[:2], p[:2])
+    for k in range(FRAMES):
+        stream, now = step(guided, stream, q[k], p[k])
+        # Rounding grows from frame to frame.
+        assert float(jnp.abs(now["bottom"] - whole[k]).max()) < 1e-5 * 6**k
+
+
+@pytest.mark.release
+def test_blocks_of_a_clip_go_on_from_each_other(guided, motion):
+    clip = dress(motion, ["bottom"], method="guided", inference=NANO, include_body=False)
+    whole = cloth_of(guided, motion.rotations, motion.root)["bottom"]
+    assert clip.stages[-2].name == "guided simulation" and clip.method == "guided"
+    np.testing.assert_allclose(clip.meshes[0].positions[:4], whole[:4], atol=2e-3)
+    # Across the block's end cloth doesn't start anew: it would jump by millimetres at once.
+    found = np.asarray(clip.meshes[0].positions)
+    moved = np.linalg.norm(np.diff(found, n=2, axis=0), axis=2).mean(axis=1)
+    assert moved.max() < 3.0 * np.median(moved[5:])
+
+
+@pytest.mark.release
+def test_cloth_starts_anew_after_what_is_not_finite(guided, motion):
+    q, p = motion.rotations[:24], motion.root[:24]
+    broken = q.at[5, 3, 0].set(jnp.nan)
+    found = cloth_of(guided, broken, p)
+    window = guided.history_length
+    ok = np.asarray(found.ok)
+    assert not ok[5] and ok[:5].all() and ok[5 + window + 2 :].all()
+
+
+@pytest.mark.release
+def test_people_side_by_side_do_not_see_each_other(guided, motion):
+    pairs = [(motion.rotations[k : k + 6], motion.root[k : k + 6]) for k in (0, 20)]
+    both = [jnp.stack(x) for x in zip(*pairs, strict=True)]
+    together = jax.jit(jax.vmap(lambda q, p: clothe(guided, q, p, 30.0)["bottom"]))(*both)
+    for k, pair in enumerate(pairs):
+        alone = cloth_of(guided, *pair)["bottom"]
+        np.testing.assert_allclose(together[k][:3], alone[:3], atol=1e-3)
+
+
+@pytest.mark.release
+def test_gradients_by_the_pose(guided, motion):
+    """Along the root's height, against a difference over 2 mm."""
+    q, p = motion.rotations[:4], motion.root[:4]
+
+    def height(dy):
+        moved = p.at[:, 1].add(dy * jnp.arange(4.0))
+        cloth = clothe(guided, q, moved, 30.0)["bottom"]
+        return jnp.mean(cloth[-1, :, 1])
+
+    value, slope = jax.jit(jax.value_and_grad(height))(0.0)
+    ahead, back = (float(jax.jit(height)(s)) for s in (1e-3, -1e-3))
+    assert np.isfinite(float(value))
+    assert float(slope) == pytest.approx((ahead - back) / 2e-3, rel=0.05)
+
+
+@pytest.mark.release
+def test_fabric_and_wind_act(motion):
+    q, p = motion.rotations[:24], motion.root[:24]
+
+    def last(wear, **options):
+        dresser = make_dresser(
+            [wear], method="guided", inference=NANO, simulation=Simulation(**options)
+        )
+        return np.asarray(cloth_of(dresser, q, p)["dress"][-1])
+
+    calm, stiff = last("dress:fabric=silk"), last("dress:fabric=denim")
+    blown = last("dress:fabric=silk", wind=(0.0, 0.0, -12.0))
+    assert np.linalg.norm(stiff - calm, axis=1).max() > 0.005
+    assert float(np.mean(blown[:, 2] - calm[:, 2])) < -0.002
+    free = last("dress:fabric=silk", effects=None, substeps=16)
+    assert np.isfinite(free).all()
+
+
+@pytest.mark.release
+def test_another_guide_and_other_rates(motion, guided):
+    """A stronger guide holds the patches nearer; 60 frames a second are as far from 30 in bending
+    as in substeps."""
+    q, p = motion.rotations[:FRAMES], motion.root[:FRAMES]
+    bare = Inference(weights="nano", strain_iterations=0, collisions=False)
+    predicted = clothe(make_dresser(["bottom"], inference=bare), q, p, 30.0)["bottom"]
+    away = []
+    for seconds in (0.003, 0.1):
+        from physxnet_jax.simulation import STANDARD
+
+        options = Simulation(effects=(*STANDARD, Guide(time_constant=seconds)))
+        found = make_dresser(["bottom"], method="guided", inference=NANO, simulation=options)
+        x = cloth_of(found, q, p)["bottom"][-1]
+        means = guided.guided.guide.means
+        gap = means(x[:, :, None]) - means(predicted[-1][:, :, None])
+        away.append(float(jnp.linalg.norm(gap[..., 0], axis=1).mean()))
+    assert away[0] < 0.5 * away[1]
+    fast = cloth_of(guided, q, p, fps=60.0)
+    assert bool(fast.ok.all())
+    assert _softness(240.0) == pytest.approx(8 / 128) and _softness(1e6) == 1.0
+
+
+def test_options_that_it_has_not_are_refused(guided):
+    for options in ({"engine": "bdf2"}, {"refine": 0.02}):
+        with pytest.raises(PhysXNetError, match="substeps and effects alone"):
+            make_dresser(
+                ["bottom"], method="guided", inference=NANO, simulation=Simulation(**options)
+            )
+    with pytest.raises(FormatError, match="positive"):
+        Simulation(substeps=0)
+    with pytest.raises(ValueError, match="guided simulation"):
+        with_shape(guided, guided.body.default_shape())
+    assert guided.strain is None and guided.colliders is None and guided.layers is None
