@@ -31,7 +31,7 @@ Posed = tuple[Float[Array, "_ 3"], ...]
 _SUBSTEPS = 8
 # Substeps a frame at which bending needs no correction.
 _CONVERGED = 128
-# Rate at which `Dresser` prepares a scene [1/s]; others are prepared where they are asked for.
+# Rate for which a scene is prepared [1/s]; for others it is prepared again within the call.
 _RATE = 30.0
 # Time constant of the guide for each substep a frame [s]: the finer, the freer.
 _TIME_CONSTANT = 0.00125
