@@ -167,7 +167,7 @@ def live(data: str, weights: Any, action: str, _: str) -> Iterator[dict]:
                 inference=Inference(weights=weights, strain_iterations=0, collisions=False),
                 simulation=Simulation(substeps=substeps),
             )
-            stream = init_stream(dresser, motion.rotations[:2], motion.root[:2])
+            stream = init_stream(dresser, motion.rotations[:2], motion.root[:2], motion.fps)
             times = []
             for k in range(TIMED):
                 pose = motion.rotations[k], motion.root[k]

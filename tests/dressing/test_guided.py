@@ -93,7 +93,7 @@ def test_cloth_starts_anew_after_what_is_not_finite(guided, motion):
     q, p = motion.rotations[:24], motion.root[:24]
     broken = q.at[5, 3, 0].set(jnp.nan)
     found = cloth_of(guided, broken, p)
-    window = guided.history_length
+    window = guided.history_length()
     ok = np.asarray(found.ok)
     assert not ok[5] and ok[:5].all() and ok[5 + window + 2 :].all()
 

@@ -39,6 +39,21 @@ def jaxpr(dresser, motion):
     return re.sub(r"0x[0-9a-f]+", "", text)
 
 
+def test_sixty_frames_a_second_are_every_other_of_thirty():
+    """Features are of the same moments; before the clip motion is extrapolated either way."""
+    slow, fast = (load_motion("punch", fps=fps) for fps in (30.0, 60.0))
+    dresser = make_dresser(["bottom"], inference=PLAIN)
+    assert dresser.history_length(60.0) == 2 * dresser.history_length(30.0)
+    a = clothe(dresser, slow.rotations[:12], slow.root[:12], 30.0)["bottom"]
+    b = clothe(dresser, fast.rotations[:23], fast.root[:23], 60.0)["bottom"]
+    np.testing.assert_allclose(b[::2][5:], a[5:], atol=2e-4)
+    stream = init_stream(dresser, fast.rotations[0], fast.root[0])
+    with pytest.raises(ValueError, match="pass fps to init_stream"):
+        clothe_step(dresser, stream, fast.rotations[0], fast.root[0], 60.0)
+    stream = init_stream(dresser, fast.rotations[0], fast.root[0], 60.0)
+    assert clothe_step(dresser, stream, fast.rotations[0], fast.root[0], 60.0)[1].ok
+
+
 def test_unrequested_steps_are_absent_from_the_program(motion):
     wear = ["top", "bottom"]
     plain = make_dresser(wear, inference=PLAIN)
@@ -60,7 +75,7 @@ def test_unrequested_steps_are_absent_from_the_program(motion):
 
 def test_skinning_needs_no_binding(motion):
     dresser = make_dresser(["bottom"], method="lbs", inference=Inference(collisions=False))
-    assert dresser.predictor is None and dresser.strain is None and dresser.history_length == 0
+    assert dresser.predictor is None and dresser.strain is None and dresser.history_length() == 0
     assert not hasattr(dresser.worn[0], "binding")
     whole = clothe(dresser, motion.rotations, motion.root, 30.0)["bottom"]
     stream = init_stream(dresser, motion.rotations[0], motion.root[0])

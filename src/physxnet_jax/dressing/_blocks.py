@@ -83,7 +83,7 @@ def infer_clip(dresser: Dresser, clip: PosedClip) -> Iterator[Block]:
     Yields:
         Blocks of at most `BLOCK` frames, in order.
     """
-    history = dresser.history_length
+    history = dresser.history_length(clip.motion.fps)
     r, t = clip.rotations, clip.translations
     if history:
         before = history_transforms(dresser.body, dresser.rest, clip.motion, history, clip.past)

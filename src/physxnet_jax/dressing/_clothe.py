@@ -121,7 +121,7 @@ def clothe(
     _check_pose(dresser.body, rotations, root, ("frames",))
     if rotations.shape[0] == 0:
         raise ValueError("the clip has no frames; clothe needs at least one.")
-    history = extrapolate_history(rotations, root, dresser.history_length)
+    history = extrapolate_history(rotations, root, dresser.history_length(fps))
     joints = (jnp.concatenate(pair) for pair in zip(history, (rotations, root), strict=True))
     transforms = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*joints)
     return _make_clothed(dresser, infer(dresser, *transforms, fps)[1])
@@ -131,6 +131,7 @@ def init_stream(
     dresser: Dresser,
     rotations: Float[Array, "joints 4"] | Float[Array, "frames joints 4"],
     root: Float[Array, "3"] | Float[Array, "frames 3"],
+    fps: float = 30.0,
 ) -> Stream:
     """Makes the state before the first frame of `clothe_step`.
 
@@ -140,6 +141,7 @@ def init_stream(
             it; or of the first frames (two are enough), whose motion is extrapolated
             backwards as in `clothe`.
         root: Position of the root joint [m] in the same frames.
+        fps: Frames per second of the stream; static under `jax.jit`.
 
     Returns:
         The stream before the first frame.
@@ -155,7 +157,7 @@ def init_stream(
     if dresser.predictor is None:
         return Stream(points=None)
     texels = dresser.predictor.texel_points
-    history = extrapolate_history(rotations, root, dresser.history_length)
+    history = extrapolate_history(rotations, root, dresser.history_length(fps))
     r, t = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*history)
     points = jax.vmap(lambda a, b: skin_points(texels.rest, texels.weights, a, b)[0])(r, t)
     scene = dresser.guided
@@ -185,7 +187,7 @@ def clothe_step(
         The stream for the next frame, and the garments of this one.
 
     Raises:
-        ValueError: The skeleton isn't the body's.
+        ValueError: The skeleton isn't the body's, or the stream was made for another frame rate.
 
     Example:
         >>> step = jax.jit(clothe_step, static_argnames="fps", donate_argnames="stream")
@@ -214,6 +216,11 @@ def _predict_step(
     if predictor is None or stream.points is None:
         return stream, predict_cloth(dresser, rotations[None], translations[None], fps)
     texels, inputs = predictor.texel_points, predictor.config.inputs
+    if stream.points.shape[0] != dresser.history_length(fps):
+        raise ValueError(
+            f"the stream keeps {stream.points.shape[0]} frames, but at {fps:g} frames per second"
+            f" {dresser.history_length(fps)} are needed: pass fps to init_stream too."
+        )
     points, blend = skin_points(texels.rest, texels.weights, rotations, translations)
     window = jnp.concatenate([stream.points, points[None]])
     features = point_features(window, blend[None], fps, inputs)

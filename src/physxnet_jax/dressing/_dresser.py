@@ -75,10 +75,11 @@ class Dresser:
         """Triangles of each garment, shape [faces, 3]."""
         return tuple(g.mesh.faces for g in self.garments)
 
-    @property
-    def history_length(self) -> int:
-        """Number of frames that prediction needs before the first one."""
-        return 0 if self.predictor is None else self.predictor.config.inputs.window - 1
+    def history_length(self, fps: float = 30.0) -> int:
+        """Number of frames that prediction needs before the first one, at a frame rate."""
+        if self.predictor is None:
+            return 0
+        return self.predictor.config.inputs.at_rate(fps).window - 1
 
     @property
     def outfit(self) -> Outfit:

@@ -34,7 +34,9 @@ _CONVERGED = 128
 # Rate for which a scene is prepared [1/s]; for others it is prepared again within the call.
 _RATE = 30.0
 # Time constant of the guide for each substep a frame [s]: the finer, the freer.
-_TIME_CONSTANT = 0.00125
+_TIME_CONSTANT = 0.0025
+# Distance between the middles of patches [m]: nearer ones pass on the network's own noise.
+_SPACING = 0.12
 # Distance of a patch from its prediction at which the cloth starts anew [m].
 _ASTRAY = 0.4
 
@@ -121,7 +123,7 @@ def prepare_guided(
     substeps = simulation.substeps or _SUBSTEPS
     solver = dataclasses.replace(simulation, substeps=substeps).solver
     given = [e for e in simulation.effects or () if isinstance(e, Guide)]
-    guide = given or [Guide(time_constant=_TIME_CONSTANT * substeps)]
+    guide = given or [Guide(spacing=_SPACING, time_constant=_TIME_CONSTANT * substeps)]
     scene = build_scene(garments, body, shape, simulation, guide)
     places = {id(g): k for k, g in enumerate(garments)}
     prepared = prepare_scene(scene)

@@ -80,7 +80,7 @@ def infer(
     Returns:
         Garments before collision resolution, the result [m], and simulated cloth in the last frame.
     """
-    first = dresser.history_length
+    first = dresser.history_length(fps)
     r, t = rotations[first:], translations[first:]
     predicted = predict_cloth(dresser, rotations, translations, fps)
     if dresser.guided is None:

@@ -278,7 +278,7 @@ def clothing_cost(
     q, p = motion.rotations[pick], motion.root[pick]
     began = time.perf_counter()
     if batch == 1:
-        stream = init_stream(dresser, q[0], p[0])
+        stream = init_stream(dresser, q[0], p[0], motion.fps)
         live = jax.jit(clothe_step, static_argnames="fps")
         program = live.lower(dresser, stream, q[0], p[0], fps=motion.fps).compile()
 

@@ -66,6 +66,10 @@ class Method(Protocol):
         ...
 
 
+def _none(fps: float) -> int:
+    return 0
+
+
 @dataclasses.dataclass
 class Blockwise:
     """A method that is a pure function of the joint transforms of a block of frames.
@@ -74,16 +78,16 @@ class Blockwise:
         block: Maps a garment, world rotations and translations of joints (including
             ``history`` earlier frames) and the frame rate to cloth.
         wear: Maps a garment to the form that ``block`` takes.
-        history: Number of earlier frames that ``block`` uses.
+        history: Number of earlier frames that ``block`` uses at a frame rate.
     """
 
     block: Callable[[Any, Array, Array, float], Array]
     wear: Callable[[Clothing], Any]
-    history: int = 0
+    history: Callable[[float], int] = _none
 
     def __call__(self, motion: Motion, name: Clothing) -> Prediction:
         """The cloth in every frame."""
-        body = load_body()
+        body, history = load_body(), self.history(motion.fps)
         rest = body.rest_vertices(shape_of(name))
         world, shift = clip_transforms(body, rest, motion)
         worn = self.wear(name)
@@ -91,7 +95,7 @@ class Blockwise:
         # The first block runs twice, so that compilation is excluded from the time.
         for start in (0, *range(0, len(world), BLOCK)):
             began = time.perf_counter()
-            r, t = (padded_block(x, start, self.history) for x in (world, shift))
+            r, t = (padded_block(x, start, history) for x in (world, shift))
             out = self.block(worn, jnp.asarray(r), jnp.asarray(t), motion.fps)
             blocks.append(np.asarray(out))
             times.append(1e3 * (time.perf_counter() - began) / BLOCK)
@@ -158,7 +162,8 @@ def network(inference: Inference, precision: Precision = "float32") -> Blockwise
             [garment_of(name)], shape=shape_of(name), inference=loaded, precision=precision
         )
 
-    return Blockwise(_infer, wear, predictor.config.inputs.window - 1)
+    inputs = predictor.config.inputs
+    return Blockwise(_infer, wear, lambda fps: inputs.at_rate(fps).window - 1)
 
 
 class Guided:

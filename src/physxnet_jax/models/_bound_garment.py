@@ -145,7 +145,7 @@ def dress_frames(
     Args:
         predictor: The network.
         bound_garments: Garments to dress.
-        rotations: World rotations of joints, with ``config.inputs.window - 1`` frames
+        rotations: World rotations of joints, with ``config.inputs.at_rate(fps).window - 1`` frames
             before the first output frame (see `pad_clip`).
         translations: World translations of joints [m], likewise.
         fps: Frames per second.
@@ -160,7 +160,7 @@ def dress_frames(
         predictor, bound_garments, normalise(features, predictor.normalisation, inputs)
     )
     family: Family = predictor.config.family
-    last = slice(inputs.window - 1, None)
+    last = slice(inputs.at_rate(fps).window - 1, None)
     return tuple(
         jax.vmap(lambda r, t, o, w=w: apply_sampled_offsets(w, r, t, o, family))(
             rotations[last], translations[last], offsets

@@ -13,6 +13,8 @@ from ..uv import acceleration_maps, velocity_maps
 
 Family = Literal["paper", "local"]
 
+# Frames per second at which networks learn.
+_RATE = 30.0
 _EXACT = jax.lax.Precision.HIGHEST
 
 
@@ -25,6 +27,7 @@ class FeatureConfig:
             rotation nearest to its skinning.
         frames: Number of input frames: k - (frames - 1) stride, ..., k - stride, k.
         stride: Frames from one input frame to the next.
+        span: Frames over which velocities and accelerations are taken.
         acceleration: Include accelerations besides velocities.
         gravity: Include the direction of gravity (``local`` only: elsewhere it is constant).
         position: Include the texel's position relative to the middle of the body (``local``
@@ -34,18 +37,34 @@ class FeatureConfig:
     family: Family = "local"
     frames: int = 3
     stride: int = 1
+    span: int = 1
     acceleration: bool = True
     gravity: bool = True
     position: bool = True
 
     def __post_init__(self) -> None:
-        if self.frames < 1 or self.stride < 1:
-            raise ValueError(f"{self}: frames and stride must be at least 1.")
+        if self.frames < 1 or self.stride < 1 or self.span < 1:
+            raise ValueError(f"{self}: frames, stride and span must be at least 1.")
+
+    def at_rate(self, fps: float) -> "FeatureConfig":
+        """These features, which are of 30 frames per second, at another rate.
+
+        They are of the same moments, to the nearest frame: at 60 and 120 frames per second exactly
+        the same.
+
+        Args:
+            fps: Frames per second of the motion.
+
+        >>> FeatureConfig(frames=4, stride=4).at_rate(60.0).window
+        29
+        """
+        stride, span = (max(1, round(n * fps / _RATE)) for n in (self.stride, self.span))
+        return dataclasses.replace(self, stride=stride, span=span)
 
     @property
     def window(self) -> int:
-        """Poses needed for one prediction; an acceleration reaches two frames back."""
-        return (self.frames - 1) * self.stride + 3
+        """Poses needed for one prediction; an acceleration reaches two spans back."""
+        return (self.frames - 1) * self.stride + 2 * self.span + 1
 
     @property
     def kinds(self) -> tuple[str, ...]:
@@ -87,12 +106,12 @@ def clip_features(
     Args:
         rest: Texel points at rest [m].
         weights: Their skinning weights.
-        rotations: World rotations of joints of all frames, with ``inputs.window - 1``
-            frames before the first output frame. At the start of a clip, repeat its first
-            frame there.
+        rotations: World rotations of joints of all frames, with ``window - 1`` frames of
+            ``inputs.at_rate(fps)`` before the first output frame. At the start of a clip, repeat
+            its first frame there.
         translations: World translations of joints [m], likewise.
         fps: Frames per second.
-        inputs: Which features to compute.
+        inputs: Which features to compute, at 30 frames per second.
 
     Returns:
         Features of every covered texel: velocities [m/s], oldest first, accelerations
@@ -104,7 +123,7 @@ def clip_features(
     points, blends = jax.vmap(skin_points, in_axes=(None, None, 0, 0))(
         rest, weights, rotations, translations
     )
-    return point_features(points, blends[inputs.window - 1 :], fps, inputs)
+    return point_features(points, blends[inputs.at_rate(fps).window - 1 :], fps, inputs)
 
 
 def point_features(
@@ -116,18 +135,19 @@ def point_features(
     """`clip_features` from points that are already skinned.
 
     Args:
-        points: Skinned texel points [m], with ``inputs.window - 1`` frames before the first
-            output frame.
+        points: Skinned texel points [m], with ``window - 1`` frames of ``inputs.at_rate(fps)``
+            before the first output frame.
         blends: Linear parts of the skinning in the output frames.
         fps: Frames per second.
-        inputs: Which features to compute.
+        inputs: Which features to compute, at 30 frames per second.
     """
+    inputs = inputs.at_rate(fps)
     lead = inputs.window - 1
     frames, texels = blends.shape[:2]
     back = [lead - inputs.stride * k for k in range(inputs.frames - 1, -1, -1)]
-    moved = [velocity_maps(points, fps)]
+    moved = [velocity_maps(points, fps, inputs.span)]
     if inputs.acceleration:
-        moved.append(acceleration_maps(points, fps))
+        moved.append(acceleration_maps(points, fps, inputs.span))
     both = jnp.stack([x[k : k + frames] for x in moved for k in back], axis=2)
     if inputs.family == "paper":
         return both.reshape(frames, texels, -1)

@@ -169,8 +169,8 @@ class Predictor:
         ``templates`` are computed.
 
         Args:
-            rotations: World rotations of joints, with `FeatureConfig.window` - 1 frames before the
-                first output frame (see `pad_clip`).
+            rotations: World rotations of joints, with `FeatureConfig.window` - 1 frames, at this
+                rate, before the first output frame (see `pad_clip`).
             translations: World translations of joints [m], likewise.
             fps: Frames per second.
             templates: Templates whose maps to predict.

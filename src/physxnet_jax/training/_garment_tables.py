@@ -17,7 +17,7 @@ from ..typing import pytree
 from ..uv import Atlas, bind, condition_maps, make_atlas
 from ._targets import motion_scales, scale_of
 
-# Distance between the middles of patches [m], as in a guided simulation.
+# Distance between the middles of patches [m].
 _PATCH = 0.08
 
 

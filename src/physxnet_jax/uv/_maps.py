@@ -14,7 +14,7 @@ def body_map(
 
 
 def velocity_maps(
-    points: Float[Array, "frames texels 3"], fps: float
+    points: Float[Array, "frames texels 3"], fps: float, span: int = 1
 ) -> Float[Array, "frames texels 3"]:
     """I_v[k] = I_B[k] - I_B[k-1], in m/s (PhysXNet, equation 6).
 
@@ -23,26 +23,28 @@ def velocity_maps(
     Args:
         points: Texel positions of successive frames [m].
         fps: Frames per second.
+        span: Frames over which differences are taken.
 
     Note (differs from the paper):
         Scaled by the frame rate, so that the network's inputs don't depend on it.
     """
-    before = jnp.concatenate([points[:1], points[:-1]])
-    return (points - before) * fps
+    before = jnp.concatenate([jnp.repeat(points[:1], span, axis=0), points[:-span]])
+    return (points - before) * (fps / span)
 
 
 def acceleration_maps(
-    points: Float[Array, "frames texels 3"], fps: float
+    points: Float[Array, "frames texels 3"], fps: float, span: int = 1
 ) -> Float[Array, "frames texels 3"]:
     """I_a[k] = I_v[k] - I_v[k-1], in m/s^2 (PhysXNet, equation 7).
 
     Args:
         points: Texel positions [m], not velocities: these are computed here.
         fps: Frames per second.
+        span: Frames over which differences are taken.
     """
-    velocity = velocity_maps(points, fps)
-    before = jnp.concatenate([jnp.zeros_like(velocity[:1]), velocity[:-1]])
-    return (velocity - before) * fps
+    velocity = velocity_maps(points, fps, span)
+    before = jnp.concatenate([jnp.zeros_like(velocity[:span]), velocity[:-span]])
+    return (velocity - before) * (fps / span)
 
 
 def cloth_offsets(

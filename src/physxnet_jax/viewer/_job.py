@@ -117,7 +117,7 @@ class Shown:
         choice = self.choice
         weights = str(choice.inference.weights)
         predictor = _predictor(weights, choice.shape, str(read_card(weights)["sha256"]))
-        window = predictor.config.inputs.window
+        window = predictor.config.inputs.at_rate(self.clip.fps).window
         rows = np.maximum(np.arange(frame + 1 - window, frame + 1), 0)
         return frame_maps(
             predictor,

@@ -55,7 +55,7 @@ class Live:
             shape=shape,
         )
         self._step = _step(motion.fps)
-        self._start = jax.jit(init_stream)
+        self._start = jax.jit(functools.partial(init_stream, fps=motion.fps))
         self._times: collections.deque[float] = collections.deque(maxlen=_RECENT)
         self._next = -1
         # The first frame compiles: its time is dropped.
@@ -70,7 +70,7 @@ class Live:
     def frame(self, index: int) -> dict[str, Float[np.ndarray, "vertices 3"]]:
         """Vertices of every garment in a frame of the clip [m]."""
         if index != self._next:
-            window = self._dresser.history_length + 1
+            window = self._dresser.history_length(self._motion.fps) + 1
             first = max(index + 1 - window, 0)
             rows = np.minimum(np.arange(first, first + window), self._motion.num_frames - 1)
             self._stream = self._start(self._dresser, *self._pose(rows))
