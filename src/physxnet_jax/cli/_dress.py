@@ -284,9 +284,7 @@ def _check_method(command: Dress) -> None:
         if command.method == "guided" and flag in ("--weights", "--tta"):
             continue
         if command.method == "guided" or (command.method != "network" and flag != "--collisions"):
-            raise PhysXNetError(
-                f"{flag} is for networks alone: leave it out with --method {command.method}."
-            )
+            raise PhysXNetError(f"{flag} is for networks: --method {command.method} has none.")
 
 
 def _print_end(

@@ -81,6 +81,8 @@ def advance(
     effects = system.effects
 
     def skin(q: Array, p: Array) -> tuple[PosedPoints | None, ...]:
+        if all(e.skinned_points is None for e in effects):
+            return tuple(None for _ in effects)
         transforms = jax.vmap(lambda a, b: system.body.transforms(system.rest, a, b))(q, p)
         return skin_effects(system, *transforms)
 
