@@ -21,7 +21,7 @@ from physxnet_jax.data import (
 from physxnet_jax.dressing import Inference, clothe, clothe_step, init_stream, make_dresser
 from physxnet_jax.errors import FormatError
 from physxnet_jax.garment import tailor
-from physxnet_jax.geometry import patch_shares
+from physxnet_jax.geometry import mesh_edges, patch_shares
 from physxnet_jax.models import ModelConfig, load_predictor, save_predictor
 from physxnet_jax.motion import load_motion
 from physxnet_jax.training import LossInputs, TrainConfig, train
@@ -115,22 +115,35 @@ def test_share_of_patches_weighs_both_parts():
             present=jnp.ones((1, 2)),
             edges=None,
             means=(jnp.zeros((1, 1, 3)), jnp.full((1, 1, 3), 0.1), jnp.ones((1, 1))),
+            differences=(jnp.zeros((1, 1, 3)), jnp.full((1, 1, 3), -0.6), jnp.ones((1, 1))),
             atlas=make_atlas(32),
         )
 
     for share, wanted in ((0.0, 0.3), (0.25, 0.25), (1.0, 0.1)):
         loss = configured_loss(dataclasses.replace(CONFIG, patch_share=share))
         assert float(loss(inputs())) == pytest.approx(wanted, rel=1e-5)
+    both = dataclasses.replace(CONFIG, patch_share=0.25, vertex_share=1.0, edge_share=0.5)
+    assert float(configured_loss(both)(inputs())) == pytest.approx(0.425, rel=1e-5)
     wrong = (({"patch_share": 2.0}, "from 0 to 1"), ({"patch_share": 0.5}, "conditions"))
     for given, says in wrong:
         with pytest.raises(ValueError, match=says):
             TrainConfig(**given)
 
 
-@pytest.mark.parametrize("wrong", [{"adversarial": True}, {"vertex_share": 1.0, "edge_share": 0.5}])
-def test_what_needs_one_garment_is_refused(wrong):
+def test_what_needs_one_garment_is_refused():
     with pytest.raises(ValueError, match="a garment of its own"):
-        dataclasses.replace(CONFIG, **wrong)
+        dataclasses.replace(CONFIG, adversarial=True)
+
+
+def test_differences_are_those_along_edges():
+    wardrobe = make_wardrobe([TIGHT, LOOSE], ("top",))
+    *_, tables = prepare_garments(MODEL, wardrobe)
+    x = jax.random.normal(jax.random.key(2), (2, wardrobe.num_vertices("top"), 3))
+    along, weight = tables["top"].differences(x, jnp.asarray([0, 1]))
+    for k, garment in enumerate(wardrobe.garments["top"]):
+        a, b = mesh_edges(np.asarray(garment.mesh.faces)).vertices.T
+        np.testing.assert_allclose(along[k, : len(a)], x[k, b] - x[k, a], atol=1e-6)
+        assert float(weight[k].sum()) == len(a)
 
 
 def test_a_network_that_cannot_see_garments_refuses_outfits(tmp_path):

@@ -101,10 +101,10 @@ class TrainConfig:
             raise ValueError(f"patch_share is {self.patch_share}; it must be from 0 to 1.")
         if self.patch_share and not self.model.conditions:
             raise ValueError("patch_share needs model.conditions.")
-        if self.model.conditions and (self.adversarial or self.edge_share):
+        if self.model.conditions and self.adversarial:
             raise ValueError(
                 "conditions: every sample has a garment of its own, whose vertices alone are"
-                " compared; set adversarial = false and leave out edge_share."
+                " compared; set adversarial = false."
             )
         if self.pyramid_levels > 1 and self.loss == "l2":
             raise ValueError(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from ..body import load_body
 from ..data import QUANTIZATION_STEP, Frames, Wardrobe
 from ..errors import FormatError
-from ..geometry import pad_rows, patch_shares
+from ..geometry import mesh_edges, pad_rows, patch_shares
 from ..models import ModelConfig, Normalisation, TexelPoints, make_texel_points
 from ..typing import pytree
 from ..uv import Atlas, bind, condition_maps, make_atlas
@@ -35,6 +35,7 @@ class GarmentTables:
         patch: Patches of 8 cm that each vertex belongs to, shape [garments, vertices, m].
         share: Their shares in the vertex, shape [garments, vertices, m].
         patches: Number of patches of the garment that has most.
+        edges: Vertices of each edge, shape [garments, edges, 2]; padding joins vertex 0 to itself.
     """
 
     texel: Int[Array, "garments vertices k"]
@@ -43,7 +44,16 @@ class GarmentTables:
     conditions: Float[Array, "garments height width channels"]
     patch: Int[Array, "garments vertices m"]
     share: Float[Array, "garments vertices m"]
+    edges: Int[Array, "garments edges 2"]
     patches: int = dataclasses.field(metadata={"static": True})
+
+    def differences(
+        self, values: Float[Array, "batch vertices 3"], garment: Int[Array, " batch"]
+    ) -> tuple[Float[Array, "batch edges 3"], Float[Array, "batch edges"]]:
+        """Differences of vertex values along the edges of one garment each, and their weights."""
+        a, b = jnp.unstack(self.edges[garment], axis=2)
+        along = jax.vmap(lambda x, i, j: x[j] - x[i])(values, a, b)
+        return along, (a != b).astype(values.dtype)
 
     def means(
         self, values: Float[Array, "batch vertices 3"], garment: Int[Array, " batch"]
@@ -120,6 +130,7 @@ def prepare_garments(
             pad_rows(patch_shares(np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces), _PATCH))
             for g in garments
         ]
+        edges = [mesh_edges(np.asarray(g.mesh.faces)).vertices for g in garments]
         tables[name] = GarmentTables(
             texel=jnp.asarray(np.stack([_padded(b.texel, count) for b in bound])),
             weight=jnp.asarray(np.stack([_padded(b.weight, count) for b in bound])),
@@ -129,6 +140,9 @@ def prepare_garments(
             conditions=jnp.stack(maps),
             patch=jnp.asarray(np.stack([_padded(i, count) for i, _ in shares])),
             share=jnp.asarray(np.stack([_padded(w, count) for _, w in shares])),
+            edges=jnp.asarray(
+                np.stack([_padded(e, max(map(len, edges))) for e in edges]).astype(np.int32)
+            ),
             patches=max(int(i.max()) + 1 for i, _ in shares),
         )
     points = make_texel_points(motion_atlas, body, rest, valid)

@@ -74,6 +74,7 @@ class LossInputs:
             garment of its own.
         means: Means of ``vertices`` over patches of 8 cm, of ``vertex_target``, and the weights of
             the patches, where every sample has a garment of its own; else None.
+        differences: The same of differences along edges.
         atlas: The atlas of the maps.
     """
 
@@ -87,6 +88,7 @@ class LossInputs:
     present: Float[Array, "batch vertices"]
     edges: Array | None
     means: tuple[Array, Array, Array] | None
+    differences: tuple[Array, Array, Array] | None
     atlas: Atlas
 
 
@@ -143,12 +145,18 @@ def configured_loss(config: TrainConfig) -> Loss:
     def loss(x: LossInputs) -> Float[Array, ""]:
         if x.target is None or x.edges is None or x.means is not None:
             squared, weight = config.loss == "l2", x.weight[:, None]
-            fine = vertex_distance(x.vertices, x.vertex_target, x.present * weight, squared=squared)
-            if not config.patch_share or x.means is None:
-                return fine
-            ours, theirs, patch_weight = x.means
-            coarse = vertex_distance(ours, theirs, patch_weight * weight, squared=squared)
-            return (1.0 - config.patch_share) * fine + config.patch_share * coarse
+            total = vertex_distance(
+                x.vertices, x.vertex_target, x.present * weight, squared=squared
+            )
+            for share, found in (
+                (config.patch_share, x.means),
+                (config.edge_share, x.differences),
+            ):
+                if share and found is not None:
+                    ours, theirs, each = found
+                    part = vertex_distance(ours, theirs, each * weight, squared=squared)
+                    total = (1.0 - share) * total + share * part
+            return total
         if config.pyramid_levels == 1:
             at_texels = distance(x.texels, x.target, x.valid, x.weight)
         else:

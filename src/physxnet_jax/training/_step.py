@@ -73,10 +73,12 @@ def _loss_inputs(
         garment = batch[f"garment_{t}"]
         vertices, present, edges = table.sample(seen, garment), table.present[garment], None
         scaled = stored / problem.normalisation.offset[t]
-        (ours, weight), (theirs, _) = (table.means(x, garment) for x in (vertices, scaled))
-        means = (ours, theirs, weight)
+        means, differences = (
+            (found(vertices, garment)[0], *found(scaled, garment))
+            for found in (table.means, table.differences)
+        )
     else:
-        means = None
+        means, differences = None, None
         vertices, edges = table.bound.sample(seen), table.edges
         present = jnp.ones(vertices.shape[:2], jnp.float32)
     return LossInputs(
@@ -90,6 +92,7 @@ def _loss_inputs(
         present=present,
         edges=edges,
         means=means,
+        differences=differences,
         atlas=problem.atlas,
     )
 
