@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import export
 
 from physxnet_jax.dressing import (
     Inference,
@@ -14,6 +15,7 @@ from physxnet_jax.dressing import (
     clothe,
     clothe_step,
     dress,
+    export_dresser,
     init_stream,
     make_dresser,
     with_shape,
@@ -176,3 +178,14 @@ def test_options_that_it_has_not_are_refused(guided):
     with pytest.raises(ValueError, match="guided simulation"):
         with_shape(guided, guided.body.default_shape())
     assert guided.strain is None and guided.colliders is None and guided.layers is None
+
+
+@pytest.mark.release
+def test_an_export_gives_the_clip(guided, motion, tmp_path):
+    """The state of the cloth is inside: any number of frames goes in, vertices come out."""
+    q, p = motion.rotations[:5], motion.root[:5]
+    export_dresser(tmp_path, guided, platforms=("cpu",))
+    blob = bytearray((tmp_path / "dresser.jaxexport").read_bytes())
+    vertices, ok = jax.jit(export.deserialize(blob).call)(q, p)
+    assert bool(ok.all())
+    np.testing.assert_allclose(vertices["bottom"], cloth_of(guided, q, p)["bottom"], atol=2e-3)
