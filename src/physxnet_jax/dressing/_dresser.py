@@ -164,7 +164,7 @@ def dress_garments(
         # The simulation has strain, contact and layers of its own.
         inference = dataclasses.replace(inference, strain_iterations=0, collisions=False)
         simulation = Simulation() if simulation is None else simulation
-        guided = prepare_guided(garments, body, shape, simulation)
+        guided = prepare_guided(outfit, shape, simulation)
     return Dresser(
         body=body,
         rest=rest,

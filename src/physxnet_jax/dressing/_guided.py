@@ -6,9 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from ..body import Body
 from ..errors import PhysXNetError
-from ..garment import Garment, SkinnedGarment, skin_garment
+from ..garment import SkinnedGarment, skin_garment
 from ..simulation import (
     PosedPoints,
     Solver,
@@ -22,7 +21,17 @@ from ..simulation import (
 )
 from ..simulation.effects import Guide, PreparedGuide
 from ..typing import pytree
+from ._inference import Inference
 from ._simulate import Simulation, build_scene
+from .postprocess import (
+    BodyCollider,
+    Layer,
+    Outfit,
+    apply_collisions,
+    apply_layers,
+    prepare_collisions,
+    prepare_layers,
+)
 
 Posed = tuple[Float[Array, "_ 3"], ...]
 """Vertices of each garment in one frame [m]."""
@@ -51,12 +60,16 @@ class GuidedScene:
         solver: Its solver at 30 frames per second.
         order: Place of each of the scene's garments among the dresser's.
         parts: First vertex of each of the scene's garments, and the number of vertices.
+        colliders: The skin near each garment, for the first frame.
+        layers: Pairs of garments whose order is enforced there.
     """
 
     system: System
     solver: Solver = dataclasses.field(metadata={"static": True})
     order: tuple[int, ...] = dataclasses.field(metadata={"static": True})
     parts: tuple[int, ...] = dataclasses.field(metadata={"static": True})
+    colliders: tuple[BodyCollider, ...] | None
+    layers: tuple[Layer, ...] | None
 
     @property
     def guide(self) -> PreparedGuide:
@@ -98,17 +111,15 @@ class GuidedState:
 
 
 def prepare_guided(
-    garments: list[Garment],
-    body: Body,
+    outfit: Outfit,
     shape: Float[Array, " shapes"] | None,
     simulation: Simulation,
 ) -> GuidedScene:
     """Prepares the simulation of garments for frames at 30 a second.
 
     Args:
-        garments: Garments in the dresser's order.
-        body: The body.
-        shape: Its shape parameters; the default if None.
+        outfit: The dresser's garments.
+        shape: Shape parameters of the body; the default if None.
         simulation: Effects, and ``substeps``.
 
     Raises:
@@ -124,8 +135,8 @@ def prepare_guided(
     solver = dataclasses.replace(simulation, substeps=substeps).solver
     given = [e for e in simulation.effects or () if isinstance(e, Guide)]
     guide = given or [Guide(spacing=_SPACING, time_constant=_TIME_CONSTANT * substeps)]
-    scene = build_scene(garments, body, shape, simulation, guide)
-    places = {id(g): k for k, g in enumerate(garments)}
+    scene = build_scene(outfit.garments, outfit.body, shape, simulation, guide)
+    places = {id(g): k for k, g in enumerate(outfit.garments)}
     prepared = prepare_scene(scene)
     system = _softened(make_system(prepared, solver), _softness(substeps * _RATE))
     return GuidedScene(
@@ -133,6 +144,8 @@ def prepare_guided(
         solver=solver,
         order=tuple(places[id(g)] for g in scene.garments),
         parts=prepared.assembly.parts,
+        colliders=prepare_collisions(outfit, Inference()),
+        layers=prepare_layers(outfit, Inference()),
     )
 
 
@@ -155,7 +168,7 @@ def init_guided(
     rotations: Float[Array, "joints 3 3"],
     translations: Float[Array, "joints 3"],
 ) -> GuidedState:
-    """The state before the first frame, which starts as predicted.
+    """The state before the first frame, which starts as predicted, but outside the body.
 
     Args:
         scene: From `prepare_guided`.
@@ -226,7 +239,15 @@ def advance_guided(
             - skin_garment(w, state.rotations, state.translations)
             for w in worn
         )
-        begun = start_state(system, target, fps * scene.joined(moved), solver=solver, fps=fps)
+        # Outside the skin: what begins within shows for many frames.
+        at = rotations[None], translations[None]
+        cloth = tuple(x[None] for x in predicted)
+        if scene.colliders is not None:
+            cloth = apply_collisions(scene.colliders, cloth, *at)
+        if scene.layers is not None:
+            cloth = apply_layers(scene.layers, cloth, *at)
+        place = scene.joined(tuple(x[0] for x in cloth))
+        begun = start_state(system, place, fps * scene.joined(moved), solver=solver, fps=fps)
         # Both branches must have one type: `start_state` gives weak ones.
         return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), begun, state.cloth)
 
