@@ -157,7 +157,9 @@ def test_every_packaged_method_can_dress():
     assert clip.method == "network"
     assert clip.inside["bottom"] == pytest.approx(clip.inside_raw["bottom"], rel=1e-4) != 0.0
     with pytest.raises(PhysXNetError, match="draft, standard, fine"):
-        Simulation.__post_init__(types.SimpleNamespace(refine=None, accuracy="perfect"))
+        Simulation.__post_init__(
+            types.SimpleNamespace(refine=None, substeps=None, accuracy="perfect")
+        )
 
 
 def test_dress_uses_the_selected_method(tmp_path, monkeypatch, capsys):
