@@ -407,3 +407,18 @@ def test_json_output_is_valid_for_non_finite_values(capsys):
     gaps = np.array([0.5, 0.1, 0.2])
     rollout = Rollout((), 30.0, {"finite": np.ones(3), "self_gap": gaps, "strain_max": gaps})
     assert rollout.worst == {"self_gap": 0.1, "strain_max": 0.5}
+
+
+@pytest.mark.release
+def test_guided_takes_fabric_wind_and_substeps_alone(tmp_path, capsys):
+    words = ["dress", "walk", "--wear", "bottom:fabric=silk", "--method", "guided", "--frames", "3"]
+    words += ["--weights", "nano", "--wind", "0", "0", "4", "--substeps", "4"]
+    assert main([*words, "-o", str(tmp_path / "silk.npz")]) == 0
+    assert (tmp_path / "silk.npz").is_file()
+    capsys.readouterr()
+    for given, says in ((["--accuracy", "fine"], "use --substeps"), (["--tta"], None)):
+        code = main([*words, *given, "-o", str(tmp_path / "other.npz")])
+        assert code == (2 if says else 0)
+        assert (says or "") in capsys.readouterr().err
+    assert main([*words, "--strain-iterations", "2", "-o", str(tmp_path / "no.npz")]) == 2
+    assert "--method guided has none" in " ".join(capsys.readouterr().err.split())
