@@ -52,7 +52,7 @@ from physxnet_jax.models import ModelConfig
 from physxnet_jax.motion import save_motion
 from physxnet_jax.simulation import PRESETS
 from physxnet_jax.training import TrainConfig, make_problem, read_metrics, train, train_step
-from physxnet_jax.training._loop import _load_data
+from physxnet_jax.training._data import load_data
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 ACTIONS, FRAMES, COMPARED = 30, 45, 20
@@ -110,7 +110,7 @@ def learn(
     if not number:
         leaves = [np.asarray(x).ravel() for x in jax.tree.leaves(predictor.state)]
         np.save(folder / "weights.npy", np.concatenate(leaves))
-    made = _load_data(config, folders)
+    made = load_data(config, folders)
     problem, state = make_problem(
         config,
         made.atlas,
@@ -283,7 +283,7 @@ def pipe(data: pathlib.Path, count: int, capacity: int, step_ms: float) -> None:
     )
     folders = list_sequences(data)[:count]
     if step_ms:
-        stream = _load_data(config, folders).frames
+        stream = load_data(config, folders).frames
         batches = stream.batches(0, slice(None))
         next(batches)
         began, waited = time.perf_counter(), batches.waited

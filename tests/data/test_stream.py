@@ -23,7 +23,7 @@ from physxnet_jax.errors import FormatError
 from physxnet_jax.garment import template
 from physxnet_jax.motion import load_motion
 from physxnet_jax.training import TrainConfig
-from physxnet_jax.training._loop import _load_data
+from physxnet_jax.training._data import load_data
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,7 +188,7 @@ def test_memory_does_not_grow_with_the_dataset(tmp_path):
             config, model=dataclasses.replace(config.model, resolution=32, templates=("bottom",))
         )
         tracemalloc.start()
-        data = _load_data(config, [tmp_path / f"a{k}" for k in range(count)])
+        data = load_data(config, [tmp_path / f"a{k}" for k in range(count)])
         batches = data.frames.batches(0, slice(None))
         for _ in range(data.frames.steps_per_epoch):
             next(batches)

@@ -23,6 +23,7 @@ from physxnet_jax.dressing import (
 from physxnet_jax.dressing._guided import _softness
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.motion import load_motion
+from physxnet_jax.simulation import STANDARD
 from physxnet_jax.simulation.effects import Guide
 
 NANO = Inference(weights="nano")
@@ -154,8 +155,6 @@ def test_another_guide_and_other_rates(motion, guided):
     predicted = clothe(make_dresser(["bottom"], inference=bare), q, p, 30.0)["bottom"]
     away = []
     for seconds in (0.003, 0.1):
-        from physxnet_jax.simulation import STANDARD
-
         options = Simulation(effects=(*STANDARD, Guide(time_constant=seconds)))
         found = make_dresser(["bottom"], method="guided", inference=NANO, simulation=options)
         x = cloth_of(found, q, p)["bottom"][-1]
@@ -169,7 +168,7 @@ def test_another_guide_and_other_rates(motion, guided):
 
 
 def test_options_that_it_has_not_are_refused(guided):
-    for options in ({"engine": "bdf2"}, {"refine": 0.02}):
+    for options in ({"engine": "bdf2"}, {"refine": 0.02}, {"accuracy": "fine"}):
         with pytest.raises(PhysXNetError, match="substeps and effects alone"):
             make_dresser(
                 ["bottom"], method="guided", inference=NANO, simulation=Simulation(**options)

@@ -24,7 +24,7 @@ from physxnet_jax.models import (
 )
 from physxnet_jax.motion import load_motion
 from physxnet_jax.training import TrainConfig, make_problem, train, train_step
-from physxnet_jax.training._loop import _load_data
+from physxnet_jax.training._data import load_data
 
 CONFIG = TrainConfig(
     model=ModelConfig(resolution=32, width=4, templates=("bottom",)),
@@ -103,7 +103,7 @@ def test_custom_network_is_saved_and_loaded(trained, tmp_path):
 
 
 def test_train_step_is_compiled_once_per_problem(walk):
-    data = _load_data(CONFIG, [walk])
+    data = load_data(CONFIG, [walk])
     problem, state = make_problem(
         CONFIG,
         data.atlas,

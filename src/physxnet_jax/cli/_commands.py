@@ -260,7 +260,7 @@ class View:
     motion: tyro.conf.Positional[str] = "walk"
     """A .bvh, .amc, .vrma, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
     method: Literal["network", "guided", "lbs", "simulate"] = "network"
-    """network, lbs (skinning alone) or simulate."""
+    """network, guided, lbs (skinning alone) or simulate."""
     compare: bool = False
     """Also simulate the same clothes, and colour by the distance between both."""
     live: bool = False

@@ -91,6 +91,7 @@ def infer_clip(dresser: Dresser, clip: PosedClip) -> Iterator[Block]:
     names = [w.name for w in dresser.worn]
     state = None
     if dresser.guided is not None:
+        # Here rather than in `infer`, so that all blocks are one program.
         state = init_guided(
             dresser.guided, jnp.asarray(r[history - 1]), jnp.asarray(t[history - 1])
         )

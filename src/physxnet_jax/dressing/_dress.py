@@ -266,8 +266,8 @@ def _infer_cloth(
     progress: Progress | None,
     on_block: Callable[[Block], None] | None,
 ) -> _Cloth:
-    kind = 0 if dresser.predictor is None else 1 if dresser.guided is None else 2
-    name = INFERENCE_STAGES[kind]
+    # A dresser that simulates has a network too.
+    name = INFERENCE_STAGES[(dresser.predictor is not None) + (dresser.guided is not None)]
     blocks: list[Block] = []
     for block in infer_clip(dresser, clip):
         blocks.append(block)

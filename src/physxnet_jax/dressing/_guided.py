@@ -27,8 +27,7 @@ from .postprocess import (
     BodyCollider,
     Layer,
     Outfit,
-    apply_collisions,
-    apply_layers,
+    apply_contacts,
     prepare_collisions,
     prepare_layers,
 )
@@ -125,11 +124,11 @@ def prepare_guided(
     Raises:
         PhysXNetError: Options that a guided simulation hasn't.
     """
-    for name in ("engine", "refine"):
-        given = getattr(simulation, name)
-        if given != getattr(Simulation(), name):
+    for name in ("accuracy", "engine", "refine"):
+        value = getattr(simulation, name)
+        if value != getattr(Simulation(), name):
             raise PhysXNetError(
-                f"{name} is {given}, but a guided simulation has substeps and effects alone."
+                f"{name} is {value}, but a guided simulation has substeps and effects alone."
             )
     substeps = simulation.substeps or _SUBSTEPS
     solver = dataclasses.replace(simulation, substeps=substeps).solver
@@ -153,7 +152,7 @@ def _softness(rate: float) -> float:
     """Factor of bending for a number of substeps a second.
 
     One sweep a substep leaves cloth too soft along its surface, but not in bending: where substeps
-    are few, the folds that it should throw are ironed out. Measured: `experiments/guided.py`.
+    are few, the folds that it should throw are ironed out.
     """
     return min(1.0, rate / (_RATE * _CONVERGED))
 
@@ -199,7 +198,7 @@ def advance_guided(
 ) -> tuple[GuidedState, Posed]:
     """Simulates the garments up to the next frame, drawn to where they are predicted.
 
-    Posed that isn't finite or that has gone astray starts anew from the prediction.
+    Cloth that isn't finite or that has gone astray starts anew from the prediction.
 
     Args:
         scene: From `prepare_guided`.
@@ -240,12 +239,10 @@ def advance_guided(
             for w in worn
         )
         # Outside the skin: what begins within shows for many frames.
-        at = rotations[None], translations[None]
         cloth = tuple(x[None] for x in predicted)
-        if scene.colliders is not None:
-            cloth = apply_collisions(scene.colliders, cloth, *at)
-        if scene.layers is not None:
-            cloth = apply_layers(scene.layers, cloth, *at)
+        cloth = apply_contacts(
+            scene.colliders, scene.layers, cloth, rotations[None], translations[None]
+        )
         place = scene.joined(tuple(x[0] for x in cloth))
         begun = start_state(system, place, fps * scene.joined(moved), solver=solver, fps=fps)
         # Both branches must have one type: `start_state` gives weak ones.

@@ -10,7 +10,7 @@ from ..garment import skin_garment
 from ..models import BoundGarment, dress_frames
 from ._dresser import Dresser
 from ._guided import GuidedState, Posed, advance_guided, init_guided
-from .postprocess import Cloth, apply_collisions, apply_layers, apply_strain
+from .postprocess import Cloth, apply_contacts, apply_strain
 
 
 def bound(dresser: Dresser) -> tuple[BoundGarment, ...]:
@@ -40,11 +40,7 @@ def resolve(
     translations: Float[Array, "frames joints 3"],
 ) -> Cloth:
     """Resolves collisions with the body and between layers [m], if requested."""
-    if dresser.colliders is not None:
-        cloth = apply_collisions(dresser.colliders, cloth, rotations, translations)
-    if dresser.layers is not None:
-        cloth = apply_layers(dresser.layers, cloth, rotations, translations)
-    return cloth
+    return apply_contacts(dresser.colliders, dresser.layers, cloth, rotations, translations)
 
 
 def limit(

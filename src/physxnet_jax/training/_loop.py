@@ -1,7 +1,5 @@
 """The training loop: resumable and logged; the result is a predictor."""
 
-import dataclasses
-import functools
 import json
 import pathlib
 import time
@@ -14,44 +12,27 @@ import optax
 from flax import nnx
 from jax.sharding import Mesh
 
-from ..body import load_body
 from ..data import (
     Batches,
     Entry,
     Frames,
-    FrameStream,
     Sequence,
-    TemplateStreams,
-    Wardrobe,
     Where,
     join_templates,
-    load_frames,
-    make_wardrobe,
-    mirrored_sequence,
-    read_entry,
     take,
 )
 from ..devices import at_home, make_mesh, own_rows, repeated, split
-from ..errors import FormatError, PhysXNetError
+from ..errors import PhysXNetError
 from ..files import append_line, atomic_write
 from ..models import (
-    Normalisation,
     Predictor,
-    TexelPoints,
 )
-from ..uv import Atlas
 from ._checkpoint import Checkpoints, config_json
 from ._config import TrainConfig
-from ._garment_tables import (
-    GarmentTables,
-    Persons,
-    measure_garment_normalisation,
-    prepare_garments,
-)
+from ._data import TrainingData, load_data
 from ._monitor import METRICS, EarlyStopping, GanMonitor, TensorBoardLogger, read_metrics
 from ._problem import Loss, Problem, TrainState, make_problem
 from ._step import eval_step, train_step
-from ._targets import ClothTables, measure_normalisation, prepare_targets
 
 _Report = Callable[[int, int, dict[str, float]], None]
 
@@ -95,7 +76,7 @@ def train(
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = make_mesh(config.batch, devices)
-    data = _load_data(config, sequences)
+    data = load_data(config, sequences)
     total = data.frames.steps_per_epoch * config.epochs
     problem, first = make_problem(
         config,
@@ -120,98 +101,6 @@ def train(
         run.close()
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class _Data:
-    """Frames to learn from, and the tables and scales that come with them."""
-
-    frames: FrameStream | TemplateStreams
-    unseen: Frames | dict[str, Frames] | None
-    atlas: Atlas
-    texel_points: TexelPoints
-    tables: dict[str, ClothTables] | dict[str, GarmentTables]
-    persons: Persons | None
-    motion_atlas: Atlas
-    normalisation: Normalisation
-
-
-def _load_data(config: TrainConfig, sequences: Items[Sequence | Where | Entry]) -> _Data:
-    body, model = load_body(), config.model
-    entries = [read_entry(s) for s in sequences]
-    wardrobe = make_wardrobe([e.outfit for e in entries], model.templates)
-    if not model.conditions and any(wardrobe.outfits):
-        raise FormatError("these data hold outfits; learn from them with conditions = true.")
-    held = _held_out(config, entries)
-    used = [e for e in entries if e.action not in config.validation]
-    if config.mirror_augmentation:
-        used += [dataclasses.replace(e, mirrored=True) for e in used]
-
-    def frames_of(seen: Wardrobe, capacity: int) -> tuple[FrameStream, Frames | None]:
-        """Frames to learn from and to validate on, of those who wear something of a wardrobe."""
-        load = functools.partial(
-            load_frames,
-            wardrobe=seen,
-            body=body,
-            window=model.inputs.window,
-            local=model.family == "local",
-        )
-        worn = {e for t, e in seen.numbers if t in seen.garments}
-        stream = FrameStream(
-            [e for e in used if e.outfit in worn],
-            load,
-            functools.partial(mirrored_sequence, body),
-            batch=config.batch,
-            seed=config.seed,
-            capacity=capacity,
-        )
-        unseen = [e.read() for e in held if e.outfit in worn]
-        return stream, load(unseen) if unseen else None
-
-    if not model.conditions:
-        stream, unseen = frames_of(wardrobe, config.frames_in_memory)
-        _check_usable(config, [unseen])
-        atlas, points, tables = prepare_targets(model)
-        first = stream.first()
-        scales = measure_normalisation(first, points, tables, model.family, seed=config.seed)
-        return _Data(
-            frames=stream,
-            unseen=unseen,
-            atlas=atlas,
-            texel_points=points,
-            tables=tables,
-            persons=None,
-            motion_atlas=atlas,
-            normalisation=scales,
-        )
-    atlas, motion_atlas, points, persons, garments = prepare_garments(model, wardrobe)
-    share = config.frames_in_memory // len(model.templates)
-    each = {
-        t: frames_of(dataclasses.replace(wardrobe, garments={t: wardrobe.garments[t]}), share)
-        for t in model.templates
-    }
-    known = {t: u for t, (_, u) in each.items() if u is not None}
-    _check_usable(config, list(known.values()))
-    streams = TemplateStreams({t: s for t, (s, _) in each.items()})
-    scales = measure_garment_normalisation(streams.first(), points, garments, seed=config.seed)
-    return _Data(
-        frames=streams,
-        unseen=known if len(known) == len(each) else None,
-        atlas=atlas,
-        texel_points=points,
-        tables=garments,
-        persons=persons,
-        motion_atlas=motion_atlas,
-        normalisation=scales,
-    )
-
-
-def _check_usable(config: TrainConfig, unseen: Items[Frames | None]) -> None:
-    known = [f for f in unseen if f is not None]
-    if known and not any(x.any() for f in known for x in f.usable.values()):
-        raise FormatError(
-            f"no usable cloth in {', '.join(config.validation)}: validate on another action."
-        )
-
-
 class _Run:
     """The run of a folder: its state, checkpoints and logs.
 
@@ -229,7 +118,7 @@ class _Run:
         folder: pathlib.Path,
         problem: Problem,
         first: TrainState,
-        data: _Data,
+        data: TrainingData,
         total: int,
         mesh: Mesh,
     ) -> None:
@@ -338,17 +227,6 @@ class _Run:
         self._checkpoints.save(self._state)
         self._checkpoints.close()
         self._best.close()
-
-
-def _held_out(config: TrainConfig, sequences: Items[Entry]) -> list[Entry]:
-    names = {s.action for s in sequences}
-    missing = [n for n in config.validation if n not in names]
-    if missing:
-        raise FormatError(
-            f"validation actions {', '.join(missing)} aren't among the sequences:"
-            f" {', '.join(sorted(names)) or 'none'}."
-        )
-    return [s for s in sequences if s.action in config.validation]
 
 
 def _validate(

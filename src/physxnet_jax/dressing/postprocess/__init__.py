@@ -15,6 +15,7 @@ from ._collisions import (
     resolve_collisions_with_skin as resolve_collisions_with_skin,
     skin_clearance as skin_clearance,
 )
+from ._contacts import apply_contacts as apply_contacts
 from ._layers import (
     Layer as Layer,
     apply_layers as apply_layers,
