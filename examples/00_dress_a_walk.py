@@ -1,4 +1,4 @@
-"""A built-in walk in top and trousers, as USD, with a picture of six moments.
+"""A built-in walk in a shirt and trousers, as USD, with a picture of six moments.
 
 python examples/00_dress_a_walk.py
 """
@@ -6,7 +6,7 @@ python examples/00_dress_a_walk.py
 import physxnet_jax as px
 from physxnet_jax.viewer import render_preview
 
-clip = px.dress("walk", ["top", "bottom"], frames=48)
+clip = px.dress("walk", ["shirt", "trousers"], frames=48)
 for path in px.write_clip("out/walk.usdc", clip.meshes, clip.fps):
     print("wrote", path)
 print("wrote", render_preview("out/walk.png", clip.meshes, clip.fps))

@@ -31,8 +31,6 @@ fitted = out / f"{file.stem}_fitted.obj"
 steps, result = px.fit_garment(file, fitted)
 print(*steps, sep="\n")
 print(f"dressed by '{result.template}', {100 * result.hit_rate:.0f} % of rays meet the body")
-clip = px.dress(
-    "walk", [fitted], inference=px.Inference(weights="small", strain_iterations=0), frames=16
-)
+clip = px.dress("walk", [fitted], frames=16)
 for path in px.write_clip(out / "own_garment.npz", clip.meshes, clip.fps):
     print("wrote", path)

@@ -64,6 +64,7 @@ save_predictor("mine", dataclasses.replace(known, state=state), name="mine")
 clip = px.dress(
     "walk",
     ["bottom"],
+    method="network",
     inference=px.Inference(weights="mine", strain_iterations=0, collisions=False),
     frames=FRAMES,
 )

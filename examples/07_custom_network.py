@@ -43,6 +43,8 @@ predictor = train(
     loss=huber,
     optimizer=optax.adamw(3e-3),
 )
-worn = px.dress("walk", ["bottom"], inference=px.Inference(weights=predictor), frames=60)
+worn = px.dress(
+    "walk", ["bottom"], method="network", inference=px.Inference(weights=predictor), frames=60
+)
 gap = jnp.linalg.norm(worn.garments[0].positions - cloth, axis=-1)
 print(f"{1e3 * float(jnp.sqrt(jnp.mean(gap**2))):.1f} mm from the simulation")

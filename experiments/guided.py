@@ -48,14 +48,14 @@ from physxnet_jax.evaluation import (
     wrinkle_error,
 )
 from physxnet_jax.files import atomic_write, write_json
-from physxnet_jax.garment import tailor
+from physxnet_jax.garment import DEFAULT_KINDS, tailor
 from physxnet_jax.models import load_predictor
 from physxnet_jax.motion import Motion, resample
 from physxnet_jax.simulation import Scene, prepare_scene, standard_effects
 from physxnet_jax.simulation.effects import Guide
 
 RESULTS = pathlib.Path(__file__).parent / "results"
-WORN = {"top": "shirt", "bottom": "trousers", "dress": "aline"}
+WORN = DEFAULT_KINDS
 SUBSTEPS = (4, 8, 16, 32)
 # A guide that doesn't pull.
 NEVER = 1e6

@@ -69,7 +69,7 @@ def wrong_side(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", default=os.environ.get("PHYSXNET_DATA", "../shared"))
-    parser.add_argument("--weights", default="local+relax")
+    parser.add_argument("--weights", default="base+relax")
     words = parser.parse_args()
     folder = pathlib.Path(words.data) / "garments"
     motion = load_motion("punch", fps=30.0)

@@ -2,7 +2,7 @@
 
 Command: python experiments/recover_motion.py
          --motion walk (a built-in clip or a motion file), --wear top bottom, --frames 12,
-         --steps 200, --weights local, --target simulate (or network),
+         --steps 200, --weights base, --target simulate (or network),
          --out experiments/results/recover_motion.json
 Cost:    3 minutes on two cores beside other work.
 Result:  recover_motion.json: how far joints are off when clothes are explained by skinning
@@ -129,7 +129,7 @@ def main() -> None:
     parser.add_argument("--wear", nargs="+", default=["top", "bottom"])
     parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--steps", type=int, default=200)
-    parser.add_argument("--weights", default="local")
+    parser.add_argument("--weights", default="base")
     parser.add_argument("--target", choices=("simulate", "network"), default="simulate")
     parser.add_argument("--out", default=str(RESULTS / "recover_motion.json"))
     words = parser.parse_args()

@@ -46,9 +46,9 @@ METHODS = (
     "perturbed",
     "nano",
     "small",
-    "local",
-    "pair+mirror",
-    "local+relax+push",
+    "base",
+    "base+relax+push",
+    "base+guided",
 )
 DATASET = """
 engine = "physxnet"

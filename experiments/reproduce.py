@@ -1,19 +1,19 @@
 """The paper's experiment: every number and figure of docs/reproduction.md.
 
-Command: python experiments/reproduce.py --data runs/ours
-         --data runs/blender --train-data runs/blender --methods lbs nearest mlp runs/blender-22
-         runs/blender-22+push runs/local-22 nano small local local+push pair+mirror paper
-         paper+push runs/paper-blender draft standard (if it is built)
-Cost:    about 40 minutes on two cores for all methods (penetration and the simulator take most
-         of it); goes on where it was stopped.
-Result:  experiments/results/test_errors.json, .md, _vertices.png and _texels.png;
+Command: python experiments/reproduce.py (the tables alone, from the results that are stored), or
+         python experiments/reproduce.py --data runs/clothes/default
+         python experiments/reproduce.py --fitted --data runs/ours
+         python experiments/reproduce.py --fitted --data runs/blender --train-data runs/blender
+         --methods lbs nearest mlp runs/blender-22 paper runs/paper-blender draft standard
+Cost:    about an hour on two cores for the clothes (simulator, guided simulation and visible skin
+         take most of it), half an hour for the fitted garments; goes on where it was stopped.
+Result:  experiments/results/test_errors.json (clothes with ease) and fitted_errors.json (the
+         garments of the paper's protocol), each with .md, _vertices.png and _texels.png;
          datasets.json; the tables between the marks of docs/reproduction.md,
-         docs/accuracy-cost.md, docs/stability.md and README.md, with those of ablations.py,
-         unseen.py, bench_peers.py, bench_engines.py, bench_training.py and `physxnet bench
-         net`; and
-         the measured table in the cards of the packaged weights. Datasets are built by
-         `physxnet dataset build` from experiments/datasets.toml, weights trained by
-         `physxnet train` from experiments/training.toml.
+         docs/accuracy-cost.md, docs/stability.md and README.md; the measured table in the cards
+         of the packaged weights; the errors by which `physxnet dress --budget-ms` chooses.
+         Datasets are built by `physxnet dataset build` from experiments/datasets.toml, weights
+         trained by `physxnet train` from experiments/training.toml.
 """
 
 import argparse
@@ -24,198 +24,205 @@ import statistics
 
 from physxnet_jax.cli import main as physxnet
 from physxnet_jax.data import (
-    CARD,
     dataset_digest,
     is_trainable,
     list_sequences,
     read_sequence,
     read_times,
 )
-from physxnet_jax.evaluation import MIRROR, ActionError, error_tables, means, summary_table
+from physxnet_jax.evaluation import ActionError, action_name, means, summary_table
 from physxnet_jax.files import atomic_write
 from physxnet_jax.garment import TEMPLATES, template
-from physxnet_jax.models import save_mean
+from physxnet_jax.viewer import write_error_report
 
 ROOT = pathlib.Path(__file__).parents[1]
 RESULTS = ROOT / "experiments/results"
 WEIGHTS = ROOT / "src/physxnet_jax/models/weights"
-OUT = RESULTS / "test_errors.json"
-# A run that isn't shipped is named by its folder.
-METHODS = (
-    "lbs",
-    "nearest",
-    "mlp",
-    "runs/local-22",
-    "runs/blender-22",
-    *(
-        f"{n}{m}{p}"
-        for n in ("nano", "small", "local", "pair")
-        for m in ("", "+mirror")
-        for p in ("", "+push", "+relax+push")
+# Rows of clothes with ease, and of the fitted garments that the paper's network learned from.
+CLOTHES, FITTED = RESULTS / "test_errors.json", RESULTS / "fitted_errors.json"
+METHODS = {
+    CLOTHES: (*("lbs", "base+relax+push", "base+guided", "perturbed"),),
+    FITTED: (
+        *("lbs", "nearest", "mlp", "nano", "nano+relax+push", "small", "small+relax+push"),
+        *("paper", "paper+push", "draft", "perturbed"),
     ),
-    "local+relax",
-    "local-muon",
-    "local-muon+mirror",
-    "paper",
-    "paper+push",
-    "draft",
-    "perturbed",
-)
+}
 # What README.md shows of them.
 SHORT = {
     "lbs": "skinning alone",
-    "nearest": "the training frame of the nearest pose",
-    "mlp": "a perceptron of the pose",
-    "local-22": "`local` from the 22 actions alone",
-    "nano": "`nano`",
-    "nano+push": "`nano`, collisions resolved",
-    "small": "`small`",
-    "small+push": "`small`, collisions resolved",
-    "local": "`local`",
-    "local+relax": "`local+relax`",
-    "local+relax+push": "`local+relax`, collisions resolved (the default)",
-    "pair+mirror": "`pair+mirror`",
-    "pair+mirror+push": "`pair+mirror`, collisions resolved",
-    "paper": "the paper's network, at reduced size",
-    "draft": "the simulator at `draft`",
+    "base+relax+push": "`base`",
+    "base+guided": "`base`, guided (the default)",
     "perturbed": "the simulation again, moved by 1e-6 m",
 }
-# What docs/reproduction.md shows action by action; all of it is in test_errors.md.
-EACH_ACTION = (
-    *("lbs", "nearest", "mlp", "local-22", "blender-22", "blender-22+push", "nano", "small"),
-    *("local", "local+relax+push", "pair+mirror", "pair+mirror+relax+push"),
-    *("paper", "paper+push", "paper-blender", "draft", "standard", "perturbed"),
-)
-# Whose errors are told over those of skinning.
-SHARES = (
-    *("local", "local-muon", "local+mirror", "pair", "pair+mirror", "pair+mirror+push"),
-    *("pair+mirror+relax+push", "perturbed"),
-)
-OURS = "physxnet"
-NETWORKS = (
-    *("local-22", "blender-22", "nano", "small", "local", "local-muon", "pair"),
-    *("paper", "paper-blender"),
+# Profiles that `--budget-ms` and `--max-error-mm` choose from. `standard` is as far from itself as
+# two of its runs part.
+LADDER = {
+    **{m: m for m in ("lbs", "base+relax+push", "base+guided")},
+    "perturbed": "standard",
+}
+# Whose squared errors are shown action by action.
+EACH = {
+    CLOTHES: ("lbs", "base+relax+push", "base+guided", "perturbed"),
+    FITTED: ("lbs", "paper", "paper-blender"),
+}
+NETWORKS = {CLOTHES: ("base+relax+push", "base+guided"), FITTED: ("paper", "paper-blender")}
+# Rows of fitted_errors.md that the page leaves out.
+LEFT_OUT = ("nano", "small", "paper+push", "blender-22+push")
+# The paper's order.
+ACTIONS = (
+    *("jump", "walking", "moon walk", "chinese dance", "punch", "balancing", "ballet"),
+    *("stretch arms", "salsa dance", "jogging", "side step", "strong gesture"),
 )
 SETS = {
-    "ours": "protocol",
-    "extra": "extra actions",
-    "left_out": "what the protocol leaves out of the clips of these",
-    "mixed": "legs of training actions with upper bodies of others, wider",
-    "mixed_extra": "legs of extra actions with upper bodies of others, wider",
-    "mixed_left_out": "the left out with upper bodies of others, wider",
-    "varied": "legs of all with upper bodies of others, slower and wider still",
-    "wide": "legs of all with upper bodies of yet others, half as far again",
-    "swift": "legs of all with upper bodies of yet others, a quarter faster",
-    "varied_left_out": "the left out with upper bodies of yet others, slower and wider still",
-    "slow": "training actions at 0.8 of their speed",
-    "taught_a": "answered by networks: legs of all with other upper bodies, slower and wider",
-    "taught_b": "answered by networks: legs of all with yet others, faster and wider",
-    "blender": "protocol, Blender",
-    "blender_extra": "extra actions, Blender",
+    "ours": "fitted garments, protocol",
+    "blender": "the same, Blender",
+    "default": "shirt, trousers, A-line dress; protocol",
+    "default_extra": "the same, extra actions",
+    "default_mixed": "the same, legs with other upper bodies, wider",
+    "default_left_out": "the same, what the protocol leaves out",
+    "variants": "36 outfits, training and extra actions",
+    "variants_mixed": "the same, legs with other upper bodies, wider",
+    "variants_left_out": "the same, what the protocol leaves out",
+    "held_out": "12 outfits that no network has seen, test actions",
 }
 SOFT = ("moon walk", "balancing", "walking")
 ABRUPT = ("strong gesture", "jump", "punch")
+COPIED = (
+    *("oracle", "accuracy_cost", "peers", "engines", "training"),
+    *("blender_import", "layers"),
+)
+DOCUMENTS = (
+    *("docs/reproduction.md", "docs/accuracy-cost.md", "docs/garments.md"),
+    *("docs/stability.md", "README.md"),
+)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--data", action="append", default=[], help="datasets; none: tables alone")
+    parser.add_argument("--fitted", action="store_true", help="the data are fitted garments")
     parser.add_argument("--train-data", default="runs/ours", help="of nearest and mlp")
-    parser.add_argument("--methods", nargs="+", default=METHODS)
+    parser.add_argument("--methods", nargs="+")
     words = parser.parse_args()
+    out = FITTED if words.fitted else CLOTHES
     for data in words.data:
-        where = ["--data", data, "--train-data", words.train_data, "--out", str(OUT)]
-        code = physxnet(["evaluate", *words.methods, *where])
+        where = ["--data", data, "--train-data", words.train_data, "--out", str(out)]
+        code = physxnet(["evaluate", *(words.methods or METHODS[out]), *where])
         if code:
             raise SystemExit(code)
-    rows = [ActionError(**r) for r in json.loads(OUT.read_text())]
-    note_datasets(pathlib.Path(words.train_data).parent)
-    few = [r for r in rows if r.method in EACH_ACTION]
-    blocks = {"summary": summary_table(rows), "errors": error_tables(few), "claims": claims(rows)}
-    blocks["short"] = short_table(rows)
-    blocks["datasets"] = dataset_table()
-    more = [ActionError(**r) for r in json.loads((RESULTS / "more_motion.json").read_text())]
-    blocks["more_motion"] = more_motion(more)
-    longer = [ActionError(**r) for r in json.loads((RESULTS / "paper_longer.json").read_text())]
-    blocks["paper_longer"] = summary_table(longer)
-    blocks["sizes"] = sizes_table()
-    blocks["bounds"] = bounds_table(rows)
-    blocks["shares"] = shares_table(rows)
-    for name in (
-        "ablations",
-        "unseen",
-        "mirrored_answer",
-        "cloth_memory",
-        "clip_start",
-        "previous_offset",
-        "accuracy_cost",
-        "precision",
-        "frames_seen",
-        "relaxation",
-        "relaxed_cost",
-        "peers",
-        "engines",
-        "training",
-        "blender_import",
-        "layers",
-    ):
-        path = RESULTS / f"{name}.md"
-        if path.is_file():
-            blocks[name] = path.read_text()
-    documents = (
-        "docs/reproduction.md",
-        "docs/accuracy-cost.md",
-        "docs/garments.md",
-        "docs/stability.md",
-        "README.md",
-    )
-    blocks["stress"] = stress_table()
-    for path in (ROOT / name for name in documents if (ROOT / name).is_file()):
+        note_datasets(pathlib.Path(data).parent)
+    for path in (CLOTHES, FITTED):
+        rows = sorted(read(path), key=lambda r: ACTIONS.index(action_name(r)))
+        write_error_report(path, rows)
+    blocks = tables()
+    for path in (ROOT / name for name in DOCUMENTS):
         text = path.read_text()
         for name, block in blocks.items():
             mark = re.compile(rf"(<!-- begin {name} -->\n).*?(<!-- end {name} -->)", re.S)
             text = mark.sub(lambda m, b=block: f"{m[1]}{b.strip()}\n{m[2]}", text)
         with atomic_write(path) as part:
             part.write_text(text)
-    save_mean(WEIGHTS / "pair", ("local", "local-muon"), card=CARD)
-    for name in NETWORKS:
-        note_measured(name, rows)
-    write_ladder(rows)
+    for name in (p.name for p in WEIGHTS.iterdir()):
+        note_measured(name)
+    write_ladder(read(CLOTHES))
 
 
-def short_table(rows: list[ActionError]) -> str:
-    """Means of a few methods, against our own simulation, beside times of accuracy_cost.json."""
-    lines = [
-        "| method | top, mm | bottom, mm | dress, mm | better than skinning | inside, % |"
-        " strain 99 % | ms a frame |",
-        "|---" * 8 + "|",
-    ]
-    ours = [r for r in rows if r.engine == "physxnet"]
-    plain = {(r.action, r.template): r.rmse_vertices_mm for r in ours if r.method == "lbs"}
-    times = quiet_times()
-    for method, told in SHORT.items():
-        mine = [r for r in ours if r.method == method]
-        of = [means(ours, method, t, "physxnet") for t in TEMPLATES]
-        cells = ["" if m is None else f"{m['rmse_vertices_mm']:.1f}" for m in of]
-        wins = sum(r.rmse_vertices_mm < plain[r.action, r.template] for r in mine)
-        cells.append("" if method == "lbs" else f"{wins} of {len(mine)}")
-        cells.append(f"{100 * sum(r.penetration_share for r in mine) / len(mine):.2f}")
-        cells.append(f"{sum(r.strain_p99 for r in mine) / len(mine):.2f}")
-        cells.append(f"{times[method]:.1f}" if method in times else "")
-        lines.append(f"| {told} | {' | '.join(cells)} |")
+def read(path: pathlib.Path) -> list[ActionError]:
+    """Rows of a result file."""
+    return [ActionError(**r) for r in json.loads(path.read_text())]
+
+
+def tables() -> dict[str, str]:
+    """Every block of the documents by its mark."""
+    clothes, fitted = read(CLOTHES), read(FITTED)
+    blocks = {
+        "summary": summary_table([r for r in fitted if r.method not in LEFT_OUT]),
+        "clothes": clothes_table(clothes),
+        "mse_clothes": squared_table(clothes, EACH[CLOTHES]),
+        "mse_fitted": squared_table(fitted, EACH[FITTED]),
+        "claims": claims(),
+        "short": short_table(clothes),
+        "datasets": dataset_table(),
+        "sizes": sizes_table(),
+        "stress": stress_table(),
+    }
+    found = ((name, RESULTS / f"{name}.md") for name in COPIED)
+    return blocks | {name: path.read_text() for name, path in found if path.is_file()}
+
+
+def squared_table(rows: list[ActionError], methods: tuple[str, ...]) -> str:
+    """The paper's measure: mean squared errors over vertices, action by action [mm^2].
+
+    Methods side by side, each against the engine that its own data come from.
+    """
+    engines = list(dict.fromkeys(r.engine for r in rows))
+    found = {
+        (r.engine, r.method, r.template, action_name(r)): round(r.mse_vertices_mm2) for r in rows
+    }
+    columns = [(e, m) for e in engines for m in methods if any(k[:2] == (e, m) for k in found)]
+    names = [m if len(engines) == 1 else f"{m} ({e})" for e, m in columns]
+    lines = [f"| garment | action | {' | '.join(names)} |", "|---" * (len(names) + 2) + "|"]
+    for t in TEMPLATES:
+        for k, action in enumerate(ACTIONS):
+            cells = (found.get((*c, t, action), "") for c in columns)
+            lines.append(f"| {'' if k else t} | {action} | {' | '.join(map(str, cells))} |")
     return "\n".join(lines) + "\n"
 
 
-def quiet_times() -> dict[str, float]:
-    """Milliseconds a frame for three garments, one frame at a time (skinning: sixteen)."""
-    found = {}
-    for r in json.loads((RESULTS / "accuracy_cost.json").read_text())["rows"]:
-        kind = r["method"]
-        if r["garments"] != 3 or r["precision"] != "float32" or r["batch"] == 32:
+def clothes_table(rows: list[ActionError]) -> str:
+    """Means over the twelve actions: errors, and whether cloth looks like cloth."""
+    lines = [
+        "| method | shirt, mm | trousers, mm | dress, mm | over skinning | better in | folds |"
+        " spectrum | tension | jerk | visible skin, % | ms a frame and garment |",
+        "|---" * 12 + "|",
+    ]
+    plain = {(r.action, r.template): r.rmse_vertices_mm for r in rows if r.method == "lbs"}
+    for method in dict.fromkeys(r.method for r in rows):
+        mine = [r for r in rows if r.method == method]
+        of = [[r.rmse_vertices_mm for r in mine if r.template == t] for t in TEMPLATES]
+        base = [[plain[r.action, t] for r in mine if r.template == t] for t in TEMPLATES]
+        ratios = [f"{sum(a) / sum(b):.2f}" for a, b in zip(of, base, strict=True) if a]
+        wins = sum(r.rmse_vertices_mm < plain[r.action, r.template] for r in mine)
+        cells = [f"{statistics.fmean(x):.1f}" if x else "" for x in of]
+        cells += ["", ""] if method == "lbs" else [" ".join(ratios), f"{wins} of {len(mine)}"]
+        cells += [
+            f"{statistics.fmean(values):.{digits}f}"
+            for digits, values in (
+                (2, [r.fold_strength for r in mine]),
+                (2, [r.spectrum for r in mine]),
+                (2, [r.tension_p99 / r.tension_p99_reference for r in mine]),
+                (2, [r.jitter / r.jitter_reference for r in mine]),
+                (3, [100.0 * r.visible_skin for r in mine]),
+                (1, [r.ms_per_frame for r in mine]),
+            )
+        ]
+        lines.append(f"| {method} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def short_table(rows: list[ActionError]) -> str:
+    """A few methods of `clothes_table`."""
+    lines = [
+        "| method | shirt, mm | trousers, mm | dress, mm | better than skinning | folds |"
+        " visible skin, % | ms a frame and garment |",
+        "|---" * 8 + "|",
+    ]
+    plain = {(r.action, r.template): r.rmse_vertices_mm for r in rows if r.method == "lbs"}
+    for method, words in SHORT.items():
+        mine = [r for r in rows if r.method == method]
+        if not mine:
             continue
-        name = {"lbs": "lbs", "simulator": r["size"], "network": r["size"]}.get(kind)
-        found[name or f"{r['size']}+push"] = r["ms_per_frame"]
-    return found
+        cells = []
+        for t in TEMPLATES:
+            here = [r.rmse_vertices_mm for r in mine if r.template == t]
+            cells.append(f"{statistics.fmean(here):.1f}" if here else "")
+        wins = sum(r.rmse_vertices_mm < plain[r.action, r.template] for r in mine)
+        cells.append("" if method == "lbs" else f"{wins} of {len(mine)}")
+        cells.append(f"{statistics.fmean(r.fold_strength for r in mine):.2f}")
+        cells.append(f"{100 * statistics.fmean(r.visible_skin for r in mine):.3f}")
+        cells.append(f"{statistics.fmean(r.ms_per_frame for r in mine):.1f}")
+        lines.append(f"| {words} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
 
 
 def stress_table() -> str:
@@ -225,19 +232,16 @@ def stress_table() -> str:
     for r in json.loads((RESULTS / "stress.json").read_text()):
         values = [f"{r[k]:.3g}" if k in r else "" for k in ("measured", "blender", "newton")]
         case = r["case"].replace("_", " ") if r["case"] != last else ""
-        told = [case, r["quantity"], f"{r['bound']:g}", *values]
-        lines.append(f"| {' | '.join(told)} |")
+        cells = [case, r["quantity"], f"{r['bound']:g}", *values]
+        lines.append(f"| {' | '.join(cells)} |")
         last = r["case"]
     return "\n".join(lines)
 
 
 def write_ladder(rows: list[ActionError]) -> None:
     """The errors by which `physxnet dress --budget-ms` chooses."""
-    # The teacher itself is as far from itself as two of its runs part.
-    shipped = [m for m in METHODS if m.startswith(("nano", "small", "local", "pair"))]
-    names = {n: n for n in ("lbs", *shipped, "draft")} | {"perturbed": "standard"}
     profiles = []
-    for method, name in names.items():
+    for method, name in LADDER.items():
         found = {t: m for t in TEMPLATES if (m := means(rows, method, t, "physxnet"))}
         if len(found) == len(TEMPLATES):
             profiles.append(
@@ -267,7 +271,7 @@ def note_datasets(folder: pathlib.Path) -> None:
         digest, size = dataset_digest(folder / name)
         log = read_times(folder / name)
         known[name] = {
-            "actions": len(sequences),
+            "sequences": len(sequences),
             "frames": sum(s.motion.num_frames for s in sequences),
             "garments": sum(len(s.offsets) for s in sequences),
             "came_off": sum(not is_trainable(s, t) for s in sequences for t in s.offsets),
@@ -283,153 +287,94 @@ def dataset_table() -> str:
     """A line for each dataset that was measured."""
     known = json.loads((RESULTS / "datasets.json").read_text())
     lines = [
-        "| set | actions | frames | garments simulated | came off | MB | built in, s | sha256 |",
+        "| set | clips | frames | garments simulated | came off | MB | core seconds | sha256 |",
         "|---|---|---|---|---|---|---|---|",
     ]
     lines += [
-        f"| {SETS[name]} | {d['actions']} | {d['frames']:,} | {d['garments']} | {d['came_off']} |"
-        f" {d['megabytes']} | {d['seconds'] or 'not logged'} | `{d['sha256'][:12]}` |"
+        f"| {SETS[name]} | {d['sequences']} | {d['frames']:,} | {d['garments']} |"
+        f" {d['came_off']} | {d['megabytes']} | {d['seconds'] or 'not logged'} |"
+        f" `{d['sha256'][:12]}` |"
         for name, d in known.items()
+        if name in SETS
     ]
     return "\n".join(lines)
 
 
-def note_measured(name: str, rows: list[ActionError]) -> None:
+def note_measured(name: str) -> None:
     """Writes the means of packaged weights into their card."""
     path = WEIGHTS / name / "card.json"
     if not path.is_file():
         return
     card = json.loads(path.read_text())
+    rows = read(CLOTHES if card["model"].get("conditions") else FITTED)
     card["measured"] = [
         {
+            "method": method,
             "reference": engine,
             "template": t,
             "rmse_vertices_mm": round(found["rmse_vertices_mm"], 2),
             "rmse_vertices_mm_lbs": round(plain["rmse_vertices_mm"], 2),
         }
         for engine in dict.fromkeys(r.engine for r in rows)
+        for method in (name, f"{name}+relax+push", f"{name}+guided")
         for t in TEMPLATES
-        if (found := means(rows, name, t, engine)) and (plain := means(rows, "lbs", t, engine))
+        if (found := means(rows, method, t, engine)) and (plain := means(rows, "lbs", t, engine))
     ]
     with atomic_write(path) as part:
         part.write_text(json.dumps(card, indent=1))
 
 
-def shares_table(rows: list[ActionError]) -> str:
-    """Errors over skinning's: all cells, and those in which the simulation agrees with itself.
-
-    The latter: its runs from starts 1e-6 m apart (`perturbed`) differ by less than half of what
-    skinning is off.
-    """
-    of = {(r.method, r.template, r.action): r.rmse_vertices_mm for r in rows if r.engine == OURS}
-    every = [(t, a) for t in TEMPLATES for a in sorted({a for _, _, a in of})]
-    agreed = [c for c in every if of["perturbed", *c] < 0.5 * of["lbs", *c]]
-    few = f"top, {len(agreed)} of {len(every)} cells"
-    lines = [
-        f"| method | {' | '.join(TEMPLATES)} | {few} | bottom | dress |",
-        "|---" * 7 + "|",
-    ]
-    for method in SHARES:
-        cells = []
-        for chosen in (every, agreed):
-            for t in TEMPLATES:
-                mine = [c for c in chosen if c[0] == t]
-                ours, plain = (sum(of[m, *c] for c in mine) for m in (method, "lbs"))
-                cells.append(f"{ours / plain:.3f}")
-        lines.append(f"| {method} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
-
-
-def more_motion(rows: list[ActionError]) -> str:
-    """One recipe with more motion, another optimizer, networks as teachers, and two's mean."""
-    lines = ["| asked | top, mm | bottom, mm | dress, mm |", "|---|---|---|---|"]
-    networks = ("local", "local-wide", "local-muon", "local-taught", "pair")
-    for name in (f"{n}{mirror}" for mirror in ("", MIRROR) for n in networks):
-        cells = []
-        for t in TEMPLATES:
-            found = means(rows, name, t, "physxnet")["rmse_vertices_mm"]
-            skinned = means(rows, "lbs", t, "physxnet")["rmse_vertices_mm"]
-            cells.append(f"{found:.1f} ({found / skinned:.3f})")
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def claims(rows: list[ActionError]) -> str:
+def claims() -> str:
     """The paper's claims beside what came out here."""
-    lines = ["| engine | network | claim | measured | holds |", "|---|---|---|---|---|"]
-    for engine in dict.fromkeys(r.engine for r in rows):
-        mine = {
-            (r.method, r.template, r.action): r.rmse_vertices_mm for r in rows if r.engine == engine
-        }
-        actions = sorted({a for _, _, a in mine})
-        for method in NETWORKS:
-            if not any(m == method for m, _, _ in mine):
-                continue
-
-            def mean(name: str, these=actions, method=method, mine=mine) -> float:
-                found = [mine[method, name, a] for a in these if (method, name, a) in mine]
-                return statistics.fmean(found)
-
-            cells = [k for k in mine if k[0] == method and ("lbs", *k[1:]) in mine]
-            wins = sum(mine[k] < mine["lbs", *k[1:]] for k in cells)
-            said = [("better than skinning", f"{wins} of {len(cells)} cells", wins == len(cells))]
-            # An engine may not have simulated every garment.
-            here = [t for t in TEMPLATES if any(k[:2] == (method, t) for k in mine)]
-            if len(here) == len(TEMPLATES):
-                top, bottom, dress = (mean(t) for t in TEMPLATES)
-                alike = abs(top - bottom) < 0.25 * max(top, bottom)
-                times = 2 * dress / (top + bottom)
-                said += [
-                    (
-                        "top and bottom alike (within a quarter)",
-                        f"{top:.1f} and {bottom:.1f} mm",
-                        alike,
-                    ),
-                    (
-                        "dress about twice (1.5 to 2.5 times)",
-                        f"{times:.2f} times",
-                        1.5 <= times <= 2.5,
-                    ),
+    lines = ["| data | network | claim | measured | holds |", "|---|---|---|---|---|"]
+    for path, label in ((FITTED, "fitted"), (CLOTHES, "with ease")):
+        rows = read(path)
+        for engine in dict.fromkeys(r.engine for r in rows):
+            here = [r for r in rows if r.engine == engine]
+            for network in NETWORKS[path]:
+                lines += [
+                    f"| {label}, {engine} | {network} | {claim} | {value} |"
+                    f" {'yes' if holds else 'no'} |"
+                    for claim, value, holds in claims_of(here, network)
                 ]
-            soft, abrupt = (
-                statistics.fmean(mean(t, these) for t in here) for these in (SOFT, ABRUPT)
-            )
-            said.append(
-                (
-                    "soft actions lower than abrupt ones",
-                    f"{soft:.1f} and {abrupt:.1f} mm",
-                    soft < abrupt,
-                )
-            )
-            lines += [
-                f"| {engine} | {method} | {claim} | {value} | {'yes' if holds else 'no'} |"
-                for claim, value, holds in said
-            ]
     lines += [
-        f"| any | {method} | {claim} | {value} | {'yes' if holds else 'no'} |"
-        for method in ("small", "local", "paper")
-        for claim, value, holds in claims_of_time(method)
+        f"| any | {network} | {claim} | {value} | {'yes' if holds else 'no'} |"
+        for network in ("base", "paper")
+        for claim, value, holds in claims_of_time(network)
     ]
     return "\n".join(lines)
 
 
-def bounds_table(rows: list[ActionError]) -> str:
-    """Cells of action and template that are inside the body or shaken more than is wanted."""
-    lines = [
-        "| method | cells over 0.5 % inside | at most, % | cells shaken more than the simulation |"
-        " at most, of its jerk |",
-        "|---|---|---|---|---|",
-    ]
-    ours = [r for r in rows if r.engine == "physxnet"]
-    for method in (m for m in METHODS if m.endswith("+push")):
-        mine = [r for r in ours if r.method == method]
-        inside = [100 * r.penetration_share for r in mine]
-        jerk = [r.jitter / r.jitter_reference for r in mine]
-        lines.append(
-            f"| {method} | {sum(x > 0.5 for x in inside)} of {len(mine)} | {max(inside):.2f} |"
-            f" {sum(x > 1.0 for x in jerk)} of {len(mine)} | {max(jerk):.2f} |"
+def claims_of(rows: list[ActionError], network: str) -> list[tuple[str, str, bool]]:
+    """Claims on errors, what was measured, and whether they hold."""
+    error = {(r.method, r.template, action_name(r)): r.rmse_vertices_mm for r in rows}
+    cells = [k for k in error if k[0] == network and ("lbs", *k[1:]) in error]
+    if not cells:
+        return []
+
+    def mean(name: str, these: tuple[str, ...] = ACTIONS) -> float:
+        return statistics.fmean(
+            error[network, name, a] for a in these if (network, name, a) in error
         )
-    return "\n".join(lines)
+
+    wins = sum(error[k] < error["lbs", *k[1:]] for k in cells)
+    top, bottom, dress = (mean(t) for t in TEMPLATES)
+    times = 2 * dress / (top + bottom)
+    soft, abrupt = (statistics.fmean(mean(t, these) for t in TEMPLATES) for these in (SOFT, ABRUPT))
+    return [
+        ("better than skinning", f"{wins} of {len(cells)} cells", wins == len(cells)),
+        (
+            "top and bottom alike (within a quarter)",
+            f"{top:.1f} and {bottom:.1f} mm",
+            abs(top - bottom) < 0.25 * max(top, bottom),
+        ),
+        ("dress about twice (1.5 to 2.5 times)", f"{times:.2f} times", 1.5 <= times <= 2.5),
+        (
+            "soft actions lower than abrupt ones",
+            f"{soft:.1f} and {abrupt:.1f} mm",
+            soft < abrupt,
+        ),
+    ]
 
 
 def claims_of_time(weights: str) -> list[tuple[str, str, bool]]:
@@ -437,12 +382,12 @@ def claims_of_time(weights: str) -> list[tuple[str, str, bool]]:
     one, three = (time_of("network", weights, n) for n in (1, 3))
     return [
         (
-            "one pass serves three garments (the network takes less than three times one's time)",
+            "one pass serves three garments (less than three times one's time)",
             f"{three['ms_network']:.2f} and {one['ms_network']:.2f} ms",
             three["ms_network"] < 3 * one["ms_network"],
         ),
         (
-            "31 ms a frame for three garments (the paper's GTX 1080, files included)",
+            "31 ms a frame for three garments (GTX 1080, files included)",
             f"{three['ms_per_frame']:.1f} ms (two CPU cores, no files)",
             three["ms_per_frame"] <= 31.0,
         ),
@@ -452,15 +397,15 @@ def claims_of_time(weights: str) -> list[tuple[str, str, bool]]:
 def time_of(method: str, size: str, garments: int) -> dict:
     """A row of accuracy_cost.json in float32, one frame at a time (skinning: sixteen)."""
     rows = json.loads((RESULTS / "accuracy_cost.json").read_text())["rows"]
-    told = {"method": method, "size": size, "garments": garments, "precision": "float32"}
-    (found,) = (r for r in rows if r["batch"] != 32 and told.items() <= r.items())
+    wanted = {"method": method, "size": size, "garments": garments, "precision": "float32"}
+    (found,) = (r for r in rows if r["batch"] != 32 and wanted.items() <= r.items())
     return found
 
 
 def sizes_table() -> str:
     """The paper's table of sizes and times with two columns of ours."""
-    skinned, ours = time_of("lbs", "-", 1), time_of("network", "local", 1)
-    pushed = time_of("network+push", "local", 1)
+    skinned, ours = time_of("lbs", "-", 1), time_of("network", "base", 1)
+    pushed = time_of("network+push", "base", 1)
     mesh = template("top").mesh
     # As the paper's 3D models: positions and triangles in four bytes a number.
     size = 4e-6 * (mesh.vertices.size + mesh.faces.size)
@@ -468,7 +413,7 @@ def sizes_table() -> str:
     here = f"{ours['ms_per_frame']:.1f} ms, {pushed['ms_per_frame']:.1f} with collisions resolved"
     return "\n".join(
         [
-            "| | LBS (paper) | TailorNet (paper) | PhysXNet (paper) | `lbs` here | `local` here |",
+            "| | LBS (paper) | TailorNet (paper) | PhysXNet (paper) | `lbs` here | `base` here |",
             "|---|---|---|---|---|---|",
             f"| 3D model, shirt | 1 MB | 13.5 GB | 1 MB | {size:.2f} MB | {size:.2f} MB |",
             f"| weights, shirt | - | 2.5 GB | 1 GB | - | {weights} |",

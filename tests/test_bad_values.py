@@ -333,8 +333,8 @@ def test_damaged_metadata_files_are_reported(dataset, text):
 
 
 def test_weights_size_of_an_invalid_card_is_refused(tmp_path):
-    (tmp_path / "card.json").write_text(json.dumps({"mean_of": 5}))
-    assert read_card(tmp_path) == {"mean_of": 5}
+    (tmp_path / "card.json").write_text(json.dumps({"name": 5}))
+    assert read_card(tmp_path) == {"name": 5}
     with pytest.raises(WeightsError, match="no such file"):
         weights_size(tmp_path)
 

@@ -44,7 +44,7 @@ def test_readme_table_matches_the_measurements():
     rows = json.loads((ROOT / "experiments/results/test_errors.json").read_text())
     made = runpy.run_path(str(ROOT / "experiments/reproduce.py"))
     table = made["short_table"]([ActionError(**r) for r in rows])
-    assert "| `local` |" in table and table.strip() in TEXT
+    assert "| `base` |" in table and table.strip() in TEXT
 
 
 @pytest.mark.release

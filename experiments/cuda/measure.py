@@ -274,12 +274,12 @@ def network(record: Record, toy: bool, until: float) -> None:
             largest_mm=1e3 * max(float(np.abs(g).max()) for g in gaps),
         )
     known = evaluated_errors(ROOT / "experiments/results/test_errors.json")
-    for weights in ("small",) if toy else ("local", "small"):
+    for weights in ("small",) if toy else ("base", "small"):
         for precision in ("float32",) if toy else ("float32", "bfloat16"):
             rows = network_costs(
                 Inference(weights=weights, strain_iterations=0),
                 walk,
-                {f"network{end}": known[weights + end] for end in ("", "+push")},
+                {f"network{end}": known.get(weights + end, {}) for end in ("", "+push")},
                 batches=(2,) if toy else (1, 32, 256),
                 garments=(1,) if toy else (1, 3),
                 backward=precision == "float32" and not toy,

@@ -43,6 +43,8 @@ if _TYPE_CHECKING:
         inspect_garment as inspect_garment,
         load_character as load_character,
         make_dresser as make_dresser,
+        with_cut as with_cut,
+        with_fabric as with_fabric,
         with_shape as with_shape,
     )
     from .errors import PhysXNetError as PhysXNetError
@@ -96,6 +98,8 @@ _PACKAGES = {
         "inspect_garment",
         "load_character",
         "make_dresser",
+        "with_cut",
+        "with_fabric",
         "with_shape",
     ),
     "errors": ("PhysXNetError",),
@@ -172,6 +176,8 @@ __all__ = [
     "tailor",
     "template",
     "transference",
+    "with_cut",
+    "with_fabric",
     "with_shape",
     "write_clip",
 ]

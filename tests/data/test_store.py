@@ -17,7 +17,6 @@ from physxnet_jax.data import (
     build_dataset,
     dataset_digest,
     expected_frames,
-    is_trainable,
     left_out,
     list_sequences,
     load_action,
@@ -36,7 +35,6 @@ from physxnet_jax.data._build import action_motion
 from physxnet_jax.data._files import join, last_name
 from physxnet_jax.data._store import is_stored, write_times
 from physxnet_jax.errors import FormatError, MotionError
-from physxnet_jax.evaluation import skinning
 from physxnet_jax.garment import square_sheet, template
 from physxnet_jax.motion import load_motion, make_motion, save_motion
 from physxnet_jax.simulation import XPBD, Rollout
@@ -160,37 +158,6 @@ def test_builds_resume_and_refuse_another_solver(data_dir, tmp_path):
     assert dataset_digest(tmp_path)[0] == before, "same configuration, same bytes"
     with pytest.raises(FormatError, match="another configuration"):
         build(DatasetConfig(templates=("bottom",), solver=XPBD(16, 1)))
-
-
-def test_network_predictions_are_stored_as_a_dataset(data_dir, tmp_path):
-    networks = DatasetConfig(
-        engine="network", splits=("train",), templates=("bottom",), networks=("local", "small")
-    )
-    build = functools.partial(
-        build_dataset, root=tmp_path, folder=data_dir / "mocap", only=("run",)
-    )
-    lifted = np.float32([0.0, 0.01, 0.0])
-
-    def ask(motion, name):
-        return np.asarray(skinning()(motion, name).positions) + lifted
-
-    with pytest.raises(FormatError, match="if and only if"):
-        build(networks)
-    with pytest.raises(FormatError, match="if and only if"):
-        build(dataclasses.replace(networks, engine="physxnet", networks=()), ask=ask)
-    assert build(networks, ask=ask) == 1
-    (folder,) = list_sequences(tmp_path)
-    told = read_sequence(folder)
-    np.testing.assert_allclose(
-        told.offsets["bottom"], np.broadcast_to(lifted, told.offsets["bottom"].shape), atol=6e-5
-    )
-    assert told.meta["bottom"]["networks"] == ["local", "small"] and is_trainable(told, "bottom")
-    assert build(networks, ask=lambda *_: pytest.fail("it is there")) == 0
-    with pytest.raises(FormatError, match="another configuration"):
-        build(dataclasses.replace(networks, networks=("local",)), ask=ask)
-    for engine, names in (("network", ()), ("physxnet", ("local",))):
-        with pytest.raises(ValueError, match="if and only if"):
-            DatasetConfig(engine=engine, networks=names)
 
 
 def test_configuration_augments_the_actions(data_dir):
@@ -425,7 +392,7 @@ def test_exploded_simulation_does_not_stop_a_build(tmp_path, monkeypatch):
     monkeypatch.setattr(_build, "simulate_batch", lambda *a, **k: [rollout])
     action = Action("train", "walk", "a.npz", 0.0, 3, None)
     config = DatasetConfig(templates=("top",))
-    _build._simulate(config, tmp_path, _build._Clothes("top"), ((action,),), tmp_path, None)
+    _build._simulate(config, tmp_path, _build._Clothes("top"), ((action,),), tmp_path)
     meta = read_sequence(tmp_path / "walk").meta["top"]
     assert not meta["finite"] and not usable_garment(meta)
     assert meta["worst"] == {"strain_max": pytest.approx(0.3)}

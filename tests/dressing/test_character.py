@@ -118,23 +118,29 @@ def test_network_and_simulation_dress_a_character(man, character):
     worn = dress(
         character,
         ["bottom"],
+        method="network",
         inference=Inference(weights="nano", strain_iterations=0),
         include_body=False,
     )
     true = dress(
         clip,
         ["bottom"],
+        method="network",
         inference=Inference(weights="nano", strain_iterations=0),
         shape=shape,
         fps=FPS,
     )
     assert rmse(worn.garments[0].positions, true.garments[0].positions) < 0.025
     assert [m.name for m in worn.meshes] == ["bottom"]
-    ways = {"method": "simulate", "simulation": Simulation(accuracy="draft"), "frames": 3}
-    slow = dress(character, ["bottom"], **ways)
-    assert slow.num_frames == 3 and len(slow.meshes[0].positions) == 3
-    same = dress(clip, ["bottom"], shape=shape, fps=FPS, **ways)
-    assert rmse(slow.garments[0].positions, same.garments[0].positions) < 0.025
+    nano = Inference(weights="nano")
+    for ways in (
+        {"method": "simulate", "simulation": Simulation(accuracy="draft"), "frames": 3},
+        {"method": "guided", "inference": nano, "frames": 3},
+    ):
+        slow = dress(character, ["bottom"], **ways)
+        assert slow.num_frames == 3 and len(slow.meshes[0].positions) == 3
+        same = dress(clip, ["bottom"], shape=shape, fps=FPS, **ways)
+        assert rmse(slow.garments[0].positions, same.garments[0].positions) < 0.025
 
 
 @pytest.mark.release

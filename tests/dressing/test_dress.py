@@ -25,7 +25,7 @@ def test_lbs_is_linear_blend_skinning(body, rest):
 
 @pytest.mark.release
 def test_network_cloth_differs_from_skinning_and_stays_near_the_body():
-    a = dress("walk", ["bottom", "dress"], frames=20)
+    a = dress("walk", ["bottom", "dress"], method="network", frames=20)
     b = dress("walk", ["bottom", "dress"], method="lbs", frames=20)
     for x, y in zip(a.garments, b.garments):
         gap = np.linalg.norm(x.positions - y.positions, axis=2)
@@ -83,8 +83,8 @@ def test_simulated_cloth_is_finite_and_pinned_at_the_waist():
 
 @pytest.mark.release
 def test_trousers_change_only_where_a_top_covers_them():
-    both = dress("walk", ["top", "bottom"], frames=16)
-    alone = dress("walk", ["bottom"], frames=16)
+    both = dress("walk", ["top", "bottom"], method="network", frames=16)
+    alone = dress("walk", ["bottom"], method="network", frames=16)
     rest_height = np.asarray(template("bottom").mesh.vertices)[:, 1]
     covered = rest_height > float(np.asarray(template("top").mesh.vertices)[:, 1].min())
     a, b = both.garments[1].positions, alone.garments[0].positions
@@ -115,7 +115,7 @@ def test_evaluation_matches_dress(push):
     method = network(inference)
     motion = load_motion("punch", fps=30.0)
     short = dataclasses.replace(motion, rotations=motion.rotations[:20], root=motion.root[:20])
-    clip = dress(short, ["top"], include_body=False, inference=inference)
+    clip = dress(short, ["top"], method="network", include_body=False, inference=inference)
     measured = method(short, "top").positions
     # Before the first frame somebody who is measured stood still, as in the simulation.
     lead = predictor.config.inputs.window - 1
@@ -128,15 +128,12 @@ def test_evaluation_matches_dress(push):
 def test_partial_motion_matches_the_whole_motion(start):
     """What was before its first frame is the motion's own, not made up."""
     first = round(30 * start)
-    (whole,) = dress(
-        "punch", ["top"], frames=first + 4, inference=Inference(collisions=False)
-    ).garments
-    (part,) = dress(
-        "punch", ["top"], start=start, frames=4, inference=Inference(collisions=False)
-    ).garments
+    bare = {"method": "network", "inference": Inference(collisions=False)}
+    (whole,) = dress("punch", ["top"], frames=first + 4, **bare).garments
+    (part,) = dress("punch", ["top"], start=start, frames=4, **bare).garments
     np.testing.assert_allclose(part.positions, whole.positions[first:], atol=1e-5)
     # The control: the same frames as a motion of their own.
     clip = load_motion("punch", fps=30.0)
     alone = dataclasses.replace(clip, rotations=clip.rotations[first:], root=clip.root[first:])
-    (other,) = dress(alone, ["top"], frames=4, inference=Inference(collisions=False)).garments
+    (other,) = dress(alone, ["top"], frames=4, **bare).garments
     assert np.abs(other.positions - whole.positions[first:]).max() > 1e-3

@@ -37,7 +37,7 @@ def test_clothe_matches_dress(whole, motion):
     from physxnet_jax.motion import make_motion
 
     clip = make_motion(*(np.asarray(x) for x in motion), 30.0)
-    positions = dress(clip, ["bottom"], include_body=False).garments[0].positions
+    positions = dress(clip, ["bottom"], method="network", include_body=False).garments[0].positions
     np.testing.assert_allclose(np.asarray(whole["bottom"]), positions, atol=1e-5)
 
 
@@ -108,7 +108,7 @@ def test_with_shape_supports_vmap_and_gradients(dresser, shapes, motion):
 
 
 def test_with_shape_is_refused_for_a_dress_of_the_paper_family(dresser):
-    config = dataclasses.replace(dresser.predictor.config, inputs=PAPER)
+    config = dataclasses.replace(load_predictor("paper").config, inputs=PAPER)
     worn = (dataclasses.replace(dresser.worn[0], template="dress"),)
     predictor = dataclasses.replace(dresser.predictor, config=config)
     skirt = dataclasses.replace(dresser, predictor=predictor, worn=worn)
@@ -135,10 +135,10 @@ def test_cloth_height_follows_the_root_one_to_one(dresser, motion):
 @pytest.mark.release
 def test_exported_dresser_runs_without_this_package(dresser, whole, motion, tmp_path):
     pytest.importorskip("flatbuffers")
-    files = export_dresser(tmp_path / "out", dresser, name="local")
+    files = export_dresser(tmp_path / "out", dresser, name="base")
     assert all(f.is_file() for f in files)
     card = json.loads((tmp_path / "out" / "card.json").read_text())
-    assert card["garments"] == {"bottom": 2726} and card["weights"]["name"] == "local"
+    assert card["garments"] == {"bottom": 2726} and card["weights"]["name"] == "base"
     assert card["strain_iterations"] == 8 and not card["tta"] and card["collisions"]
     assert card["platforms"] == ["cpu", "cuda"], "lowered for both, wherever it is written"
     faces = np.load(tmp_path / "out" / "garments.npz")["bottom_faces"]
@@ -250,8 +250,8 @@ def test_poses_of_another_skeleton_are_refused_under_jit_too(dresser, motion):
 
 def test_dress_accepts_a_predictor_and_a_single_garment_name(dresser, motion):
     known = dresser.predictor
-    clip = dress("walk", "bottom", inference=Inference(weights=known), frames=2)
-    again = dress("walk", ["bottom"], frames=2)
+    clip = dress("walk", "bottom", method="network", inference=Inference(weights=known), frames=2)
+    again = dress("walk", ["bottom"], method="network", frames=2)
     np.testing.assert_array_equal(clip.garments[0].positions, again.garments[0].positions)
 
 
@@ -357,6 +357,7 @@ def test_clip_starts_without_a_jump(fps):
     again = dress(
         clip,
         ["bottom"],
+        method="network",
         inference=Inference(weights="nano", strain_iterations=0, collisions=False),
         fps=fps,
         include_body=False,

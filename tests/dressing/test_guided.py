@@ -18,7 +18,6 @@ from physxnet_jax.dressing import (
     export_dresser,
     init_stream,
     make_dresser,
-    with_shape,
 )
 from physxnet_jax.dressing._guided import _softness
 from physxnet_jax.errors import FormatError, PhysXNetError
@@ -175,8 +174,6 @@ def test_options_that_it_has_not_are_refused(guided):
             )
     with pytest.raises(FormatError, match="positive"):
         Simulation(substeps=0)
-    with pytest.raises(ValueError, match="guided simulation"):
-        with_shape(guided, guided.body.default_shape())
     assert guided.strain is None and guided.colliders is None and guided.layers is None
 
 

@@ -146,16 +146,17 @@ def test_post_processing_is_timed_once_for_all_networks(tmp_path):
 def test_every_packaged_method_can_dress():
     ladder = load_cost_table()
     names = {r.name for r in ladder}
-    ways = ("", "+push", "+mirror", "+mirror+push", "+relax+push", "+mirror+relax+push")
-    assert {"lbs", *(f"local{way}" for way in ways)} <= names
+    assert {"lbs", "base+relax+push", "base+guided", "standard"} <= names
+    # None that leaves cloth in the body, but skinning.
+    assert all(n.endswith(("+push", "+guided")) for n in names - {"lbs", *PRESETS})
     for r in ladder:
         assert set(r.rmse_mm) == set(r.inside) == set(TEMPLATES)
         assert r.name.partition("+")[0] in {"lbs", *list_weights(), *PRESETS}
         assert r.identity.startswith(r.name)
     plain = {r.name: r for r in ladder}
-    clip = dress("walk", ["bottom"], frames=2, include_body=False, **plain["local"].options)
-    assert clip.method == "network"
-    assert clip.inside["bottom"] == pytest.approx(clip.inside_raw["bottom"], rel=1e-4) != 0.0
+    for name, method in (("nano+relax+push", "network"), ("base+guided", "guided")):
+        clip = dress("walk", ["bottom"], frames=2, include_body=False, **plain[name].options)
+        assert clip.method == method
     with pytest.raises(PhysXNetError, match="draft, standard, fine"):
         Simulation.__post_init__(
             types.SimpleNamespace(refine=None, substeps=None, accuracy="perfect")

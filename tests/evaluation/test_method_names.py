@@ -79,7 +79,7 @@ def test_method_suffixes_round_trip_through_options():
     assert parse_method("nano") == Inference(weights="nano", strain_iterations=0, collisions=False)
     both = parse_method("nano+mirror+relax+push")
     assert both == Inference(weights="nano", tta=True)
-    for name in ("nano", "nano+mirror", "nano+relax", "nano+mirror+relax+push", "local+push"):
+    for name in ("nano", "nano+mirror", "nano+relax", "nano+mirror+relax+push", "base+push"):
         assert method_name(parse_method(name)) == name
     options = MethodProfile("nano+mirror+relax+push", {}, {}).options
     assert options == {"method": "network", "inference": both}

@@ -21,9 +21,7 @@ from physxnet_jax.models import (
     list_weights,
     load_predictor,
     read_card,
-    save_mean,
     save_predictor,
-    weights_size,
     with_mirror_tta,
 )
 
@@ -212,25 +210,6 @@ def test_meshes_far_from_the_body_are_refused(tmp_path):
         load_garment(tmp_path / "a.fbx")
 
 
-def test_averaged_networks_list_their_members(tmp_path):
-    pair, parts = with_mirror_tta(load_predictor("pair")), ("local", "local-muon")
-    assert pair.mirror_tta and read_card("pair")["mean_of"] == list(parts)
-    assert weights_size("pair") == sum(map(weights_size, parts))
-    save_mean(tmp_path / "pair", parts, card={"licence": "as theirs"})
-    assert weights_size(tmp_path / "pair") == weights_size("pair")
-    again = read_card(tmp_path / "pair")
-    assert again["licence"] and again["sha256"] == read_card("pair")["sha256"]
-    with pytest.raises(WeightsError, match="isn't saved"):
-        save_predictor(tmp_path / "w", pair, name="copy")
-    # Other networks than those that were measured, itself among them, or none of the package.
-    for named in (["local", "small"], ["pair", "pair"], ["../weights/local", "local-muon"], []):
-        card = tmp_path / "other/card.json"
-        card.parent.mkdir(exist_ok=True)
-        card.write_text(json.dumps(read_card("pair") | {"mean_of": named}))
-        with pytest.raises(WeightsError, match="networks of this"):
-            load_predictor(card.parent)
-
-
 def test_loading_weights_draws_no_random_numbers():
     """As a fresh process has it: what is drawn is compiled first, which takes seconds."""
     code = "from physxnet_jax.models import load_predictor; load_predictor('nano')"
@@ -245,9 +224,9 @@ def test_loading_weights_draws_no_random_numbers():
 
 
 def test_packaged_weights_load_and_damage_is_detected(tmp_path):
-    assert list_weights() == ["local", "local-muon", "nano", "pair", "paper", "small"]
-    predictor = load_predictor("local")
-    assert read_card("local")["model"]["inputs"]["family"] == "local"
+    assert list_weights() == ["base", "nano", "paper", "small"]
+    predictor = load_predictor("base")
+    assert read_card("base")["model"]["inputs"]["family"] == "local"
     for other, says in (
         (fold_batch_norm(predictor), "folded"),
         (with_mirror_tta(predictor), "test-time augmentation"),
@@ -287,7 +266,7 @@ def test_packaged_weights_load_and_damage_is_detected(tmp_path):
             load_predictor(tmp_path / "w")
         with pytest.raises(WeightsError, match="not a card"):
             read_card(tmp_path / "w")
-    with pytest.raises(WeightsError, match="local"):
+    with pytest.raises(WeightsError, match="base"):
         load_predictor("second")
 
 

@@ -23,7 +23,6 @@ from physxnet_jax.models import (
     Predictor,
     apply_offsets,
     at_precision,
-    average_networks,
     bind_garment,
     clip_features,
     dress_frames,
@@ -374,40 +373,6 @@ def test_folded_batch_norm_keeps_the_predictions(worn):
     again = fold_batch_norm(folded)
     for one, two in zip(jax.tree.leaves(folded.state), jax.tree.leaves(again.state), strict=True):
         np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
-
-
-def test_averaged_networks_predict_the_mean_of_their_offsets(worn):
-    """Offsets in metres are averaged, whatever each network scales them by."""
-    atlas, surface, _ = worn
-    one, two = (trained_like(surface, atlas, LOCAL, seed=k) for k in (0, 1))
-    wide = {t: 1.7 * v for t, v in two.normalisation.offset.items()}
-    two = dataclasses.replace(
-        two, normalisation=dataclasses.replace(two.normalisation, offset=wide)
-    )
-    x = jax.random.normal(jax.random.key(3), (2, surface.rest.shape[0], LOCAL.channels))
-    asked = [p.from_features(0.3 * x, ("dress", "top")) for p in (one, two)]
-    mean = average_networks([one, two])
-    for p in (mean, fold_batch_norm(mean), fold_batch_norm(fold_batch_norm(mean))):
-        got = p.from_features(0.3 * x, ("dress", "top"))
-        for t in ("dress", "top"):
-            a, b = (np.asarray(o[t]) for o in asked)
-            # Longer offsets than training shows are shortened, before the mean or after it.
-            plain = (np.linalg.norm([a, b], axis=-1).max(0) < 0.29)[..., None]
-            assert plain.mean() > 0.3 and np.abs(a - b).max() > 0.01
-            np.testing.assert_allclose(np.asarray(got[t]) * plain, (a + b) / 2 * plain, atol=2e-5)
-    # Neither network was changed by it.
-    np.testing.assert_array_equal(
-        np.asarray(two.from_features(0.3 * x, ("top",))["top"]), np.asarray(asked[1]["top"])
-    )
-    other = dataclasses.replace(
-        two, normalisation=dataclasses.replace(two.normalisation, velocity=jnp.float32(2.0))
-    )
-    augmented = dataclasses.replace(two, mirror_tta=True)
-    for wrong in ([], [one, other], [one, augmented], [augmented, one]):
-        with pytest.raises(ValueError, match=r"no predictors|different"):
-            average_networks(wrong)
-    with pytest.raises(ValueError, match="before their batch norm is folded"):
-        average_networks([one, fold_batch_norm(two)])
 
 
 def test_bfloat16_and_float64_predictions_are_close_to_float32(worn):

@@ -41,7 +41,7 @@ def walk(body):
 def test_clean_motion_is_reported_ready(walk):
     found = inspect_motion("walk")
     assert found.problems == found.notes == found.left_out == ()
-    assert found.verdict == "ready: physxnet dress walk --wear top bottom -o walk.usdc"
+    assert found.verdict == "ready: physxnet dress walk --wear shirt trousers -o walk.usdc"
     assert (found.frames, found.fps, found.unit) == (walk.num_frames, 30.0, "m")
     assert found.seconds == pytest.approx(walk.num_frames / 30)
     steps = np.diff(np.asarray(walk.root, np.float64), axis=0)

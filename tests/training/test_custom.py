@@ -83,7 +83,14 @@ def test_custom_network_trains_and_dresses(trained):
     assert isinstance(nnx.merge(fold_batch_norm(predictor).graph, predictor.state), Tiny)
     inference = Inference(weights=predictor, collisions=False)
     assert make_dresser(["bottom"], inference=inference).predictor is not None
-    clip = dress("walk", ["bottom"], inference=inference, frames=3, include_body=False)
+    clip = dress(
+        "walk",
+        ["bottom"],
+        method="network",
+        inference=inference,
+        frames=3,
+        include_body=False,
+    )
     assert np.isfinite(clip.garments[0].positions).all()
     motion = load_motion("walk", fps=30.0)
     motion = dataclasses.replace(motion, rotations=motion.rotations[:3], root=motion.root[:3])

@@ -35,9 +35,9 @@ class Dress:
 
     motion: tyro.conf.Positional[str]
     """A .bvh, .amc, .glb, .gltf, .vrma or .npz file, or a built-in clip (see `physxnet clips`)."""
-    method: Literal["network", "guided", "lbs", "simulate"] = "network"
-    """network (packaged weights), guided (a few substeps of simulation drawn to the network), lbs
-    (skinning alone) or simulate (the teacher)."""
+    method: Literal["guided", "network", "lbs", "simulate"] = "guided"
+    """guided (a network, and a few substeps of simulation drawn to it), network (without those),
+    lbs (skinning alone) or simulate (the teacher)."""
     budget_ms: float | None = None
     """Select the most accurate method within this time per frame on this machine [ms]."""
     max_error_mm: float | None = None
@@ -259,7 +259,7 @@ class View:
 
     motion: tyro.conf.Positional[str] = "walk"
     """A .bvh, .amc, .vrma, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
-    method: Literal["network", "guided", "lbs", "simulate"] = "network"
+    method: Literal["guided", "network", "lbs", "simulate"] = "guided"
     """network, guided, lbs (skinning alone) or simulate."""
     compare: bool = False
     """Also simulate the same clothes, and colour by the distance between both."""

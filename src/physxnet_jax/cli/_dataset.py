@@ -2,7 +2,6 @@
 
 import dataclasses
 import time
-from collections.abc import Callable
 
 import numpy as np
 from rich.console import Console
@@ -19,11 +18,10 @@ from ..data import (
     read_times,
 )
 from ..errors import FormatError
-from ..evaluation import Finding, check_sequence, method_by_name, skinning
+from ..evaluation import Finding, check_sequence, skinning
 from ..files import atomic_write, check_writable
 from ..garment import TEMPLATES, Template
 from ..io import AnimatedMesh
-from ..motion import Motion
 from ..viewer import render_frame
 from ._configs import mocap_folder, read_config
 from ._experiment_commands import Dataset
@@ -52,7 +50,6 @@ def _build(command: Dataset, console: Console) -> int:
             shard=shard,
             only=command.only,
             report=lambda text, k, n: progress("garments", k, n),
-            ask=_mean_prediction(config.networks) if config.networks else None,
             ray=ray_address(command.ray),
         )
     digest, size = dataset_digest(command.out)
@@ -65,15 +62,6 @@ def _build(command: Dataset, console: Console) -> int:
     if command.terminal.json:
         print_json({"sha256": digest, "bytes": size, "simulated": done, "seconds": spent})
     return 0
-
-
-def _mean_prediction(names: tuple[str, ...]) -> Callable[[Motion, Template], np.ndarray]:
-    methods = [method_by_name(name) for name in names]
-
-    def ask(motion: Motion, name: Template) -> np.ndarray:
-        return np.mean([method(motion, name).positions for method in methods], axis=0)
-
-    return ask
 
 
 def _shard(text: str) -> tuple[int, int]:

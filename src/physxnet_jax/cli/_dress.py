@@ -48,7 +48,7 @@ class _Job:
     motion: Motion | Character
     wear: Any
     shape: Any
-    method: Literal["network", "guided", "lbs", "simulate"]
+    method: Literal["guided", "network", "lbs", "simulate"]
     inference: Inference
     simulation: Simulation
     frames: int | None
@@ -271,7 +271,7 @@ def _check_files(out: pathlib.Path | None, pictures: list[pathlib.Path], console
 
 def _check_method(command: Dress) -> None:
     """Rejects options that another option would make ineffective."""
-    method = [] if command.method == "network" else ["--method"]
+    method = [] if command.method == Dress(command.motion).method else ["--method"]
     given = [*method, *changed(command.inference), *changed(command.simulation)]
     if (command.budget_ms, command.max_error_mm) != (None, None) and given:
         raise PhysXNetError(
@@ -279,7 +279,7 @@ def _check_method(command: Dress) -> None:
         )
     if command.budget_ms is not None and command.max_error_mm is not None:
         raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
-    check_simulates(command.method, command.simulation, command.outfit)
+    check_simulates(command.method, command.simulation, command.outfit, command.inference.weights)
     for flag in changed(command.inference):
         if command.method == "guided" and flag in ("--weights", "--tta"):
             continue

@@ -44,7 +44,7 @@ class Bench:
 
     what: tyro.conf.Positional[Literal["sim", "net"]]
     """sim: the simulator. net: networks beside skinning and the simulator."""
-    weights: tuple[str, ...] = ("local",)
+    weights: tuple[str, ...] = ("base",)
     """net: names or folders of weights, or runs."""
     data: pathlib.Path | None = None
     """net: a dataset whose test actions give the errors; without one, only times are measured."""
@@ -127,8 +127,8 @@ class Train:
     that Slurm or Open MPI start join by themselves; others are given each other's address.
 
     Examples:
-      physxnet train experiments/training.toml#local --data runs/ours --out runs/local
-      physxnet train experiments/training.toml#local --data runs/ours -o runs/a --devices 2
+      physxnet train experiments/training.toml#base --data runs/default --out runs/base
+      physxnet train experiments/training.toml#base --data runs/default -o runs/a --devices 2
     """
 
     config: tyro.conf.Positional[str]
@@ -163,7 +163,7 @@ class Evaluate:
     +mirror averages with the mirrored pose, +relax limits strain and +push resolves collisions.
 
     Examples:
-      physxnet evaluate local local+push lbs --data runs/ours --out out/errors.json
+      physxnet evaluate base base+guided lbs --data runs/default --out out/errors.json
       physxnet evaluate lbs nearest mlp draft perturbed --data runs/ours --split test
     """
 

@@ -4,13 +4,13 @@ from rich.console import Console
 
 from ..dressing import export_dresser, make_dresser
 from ._commands import Export
-from ._options import check_one_fabric
+from ._options import check_fabric
 from ._progress import print_json
 
 
 def export(command: Export, console: Console) -> int:
     """Writes the function and prints how to call it."""
-    check_one_fabric(command.outfit, "Leave it out.")
+    check_fabric(command.outfit, "network", command.inference.weights)
     with console.status("binding and lowering"):
         dresser = make_dresser(command.outfit.words, inference=command.inference.build())
         files = export_dresser(

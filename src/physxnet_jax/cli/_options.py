@@ -37,7 +37,7 @@ def ray_address(option: RayAddress) -> str | None:
 class InferenceOptions:
     """Network and post-processing."""
 
-    weights: str = "local"
+    weights: str = "base"
     """Name or folder of network weights (see `physxnet clips`)."""
     tta: bool = False
     """Average with the prediction for the mirrored pose (test-time augmentation)."""
@@ -109,7 +109,7 @@ class MotionSource:
 class Outfit:
     """Outfit."""
 
-    wear: tuple[str, ...] = ("top", "bottom")
+    wear: tuple[str, ...] = ("shirt", "trousers")
     """Tailored garments (tee, shirt, trousers, skirt, aline and others, see `physxnet clips`),
     templates (top, bottom, dress) and files (.obj, .glb, .gltf, .usd*, .ply, .stl), with options
     after a colon: tee:ease=0.12,length=0.5 or coat.obj:as=top,fabric=wool. Tops go over dresses
@@ -219,19 +219,29 @@ def check_body(options: BodyOptions, source: MotionSource) -> None:
         raise PhysXNetError("--start cuts motions of the built-in body only: leave it out.")
 
 
-def check_one_fabric(outfit: Outfit, advice: str) -> None:
-    """Checks that no fabric is chosen where the networks' own is the only one.
+def check_fabric(outfit: Outfit, method: str, weights: str) -> None:
+    """Checks that a fabric is chosen only where it makes a difference.
 
     Raises:
-        PhysXNetError: One is; the message ends with the advice.
+        PhysXNetError: Neither a simulation nor the network sees it.
     """
     from ..garment import parse_wear
+    from ..models import read_card
 
-    if any(parse_wear(w).fabric for w in outfit.words):
-        raise PhysXNetError(f"--fabric, fabric=: the networks support one fabric. {advice}")
+    if method in ("guided", "simulate") or not any(parse_wear(w).fabric for w in outfit.words):
+        return
+    if method == "lbs":
+        raise PhysXNetError("--fabric, fabric=: skinning sees no fabric. Leave it out.")
+    if not read_card(weights).get("model", {}).get("conditions", False):
+        raise PhysXNetError(
+            f"--fabric, fabric=: {weights} sees no fabric. Leave it out, or add --method guided or"
+            " simulate."
+        )
 
 
-def check_simulates(method: str, simulation: SimulationOptions, outfit: Outfit) -> None:
+def check_simulates(
+    method: str, simulation: SimulationOptions, outfit: Outfit, weights: str
+) -> None:
     """Checks that options of the simulator are given to the simulator only.
 
     Raises:
@@ -248,5 +258,4 @@ def check_simulates(method: str, simulation: SimulationOptions, outfit: Outfit) 
             raise PhysXNetError(
                 f"{flag} is for whole simulations: use --substeps, or --method simulate."
             )
-    if method != "guided":
-        check_one_fabric(outfit, "Add --method guided or simulate, or leave it out.")
+    check_fabric(outfit, method, weights)

@@ -33,7 +33,12 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
     if command.html is not None:
         check_writable(command.html)
         if not command.compare:
-            check_simulates(command.method, command.simulation, command.outfit)
+            check_simulates(
+                command.method,
+                command.simulation,
+                command.outfit,
+                command.inference.weights,
+            )
     source = command.source
     if source.start:
         raise PhysXNetError("--start: the viewer shows motions from their start; leave it out.")

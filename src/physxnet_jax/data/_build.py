@@ -5,7 +5,7 @@ import functools
 import math
 import pathlib
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from typing import Any
 
 import jax
@@ -14,7 +14,7 @@ import numpy as np
 
 from ..body import Body
 from ..errors import FormatError
-from ..garment import Garment, Template, template
+from ..garment import Garment, template
 from ..jobs import Job, Report, run_jobs
 from ..motion import (
     Motion,
@@ -53,9 +53,6 @@ from ._store import (
 )
 from ._stream import index_dataset
 
-Ask = Callable[[Motion, Template], np.ndarray]
-"""Predicts a garment's vertices [m]."""
-
 
 def build_dataset(
     config: DatasetConfig,
@@ -65,7 +62,6 @@ def build_dataset(
     shard: tuple[int, int] = (0, 1),
     only: tuple[str, ...] = (),
     report: Report | None = None,
-    ask: Ask | None = None,
     ray: str | None = None,
 ) -> int:
     """Simulates actions and stores the cloth relative to its skinning.
@@ -82,8 +78,6 @@ def build_dataset(
             starting with the i-th.
         only: Names of the actions to build; all of them if empty.
         report: Callback that takes a message, the jobs done and the total number of jobs.
-        ask: Predicts a garment's vertices [m], shape [frames, vertices, 3], with the networks
-            of the configuration. Required if and only if the engine is ``network``.
         ray: Address of a Ray cluster whose machines all see ``root`` and ``folder``, or ``local``;
             None to build in this process.
 
@@ -92,13 +86,11 @@ def build_dataset(
 
     Raises:
         FormatError: ``root`` holds another dataset, an action of ``only`` isn't available,
-            ``upper_from`` selects the action itself, or ``ask`` doesn't match the engine.
+            or ``upper_from`` selects the action itself.
         MotionError: ``folder`` holds no protocol.
     """
     folder = pathlib.Path(folder).absolute()
     root = root if "://" in str(root) else pathlib.Path(root).absolute()
-    if (config.engine == "network") != (ask is not None):
-        raise FormatError(f"engine is '{config.engine}'; pass ask if and only if it is 'network'.")
     actions = _actions_in_splits(folder, config.splits)
     unknown = set(only) - {a.name for a in actions}
     if unknown:
@@ -133,7 +125,7 @@ def build_dataset(
         for at in range(0, len(missing), width):
             groups = tuple(missing[at : at + width])
             label = f"{', '.join(a.name for g in groups for a in g)}: {clothes.label}"
-            jobs.append(Job(label, _simulate, (config, root, clothes, groups, folder, ask)))
+            jobs.append(Job(label, _simulate, (config, root, clothes, groups, folder)))
     if jobs:
         remove_index(root)
     for _, lines in run_jobs(jobs, ray=ray, report=report):
@@ -279,7 +271,6 @@ def _simulate(
     clothes: _Clothes,
     groups: tuple[tuple[Action, ...], ...],
     folder: pathlib.Path,
-    ask: Ask | None,
 ) -> list[tuple[str, str, dict[str, Any]]]:
     """Stores clothes in groups of actions, one for each device; returns what each took."""
     group = tuple(action for g in groups for action in g)
@@ -290,13 +281,7 @@ def _simulate(
         place = clothes.folder(root, action)
         write_action(place, motion, action.split, clothes.outfit, clothes.number)
     start = time.perf_counter()
-    if ask is not None:
-        rollouts = []
-        for motion in motions:
-            cloth = ask(motion, clothes.name)  # pyright: ignore[reportArgumentType]
-            finite = np.asarray(np.isfinite(cloth).all(axis=(1, 2)))
-            rollouts.append(Rollout((cloth,), motion.fps, {"finite": finite}))
-    elif config.engine == "blender":
+    if config.engine == "blender":
         one = Scene(tuple(clothes.garments.values()))
         rollouts = [simulate_blender(one, m, settings=config.blender) for m in motions]
     else:

@@ -25,8 +25,7 @@ class DatasetConfig:
     """Settings of a dataset.
 
     Attributes:
-        engine: ``physxnet`` (this package's simulator), ``blender`` (the paper's) or
-            ``network``: predictions of trained networks, as targets for another one.
+        engine: ``physxnet`` (this package's simulator) or ``blender`` (the paper's).
         splits: Splits of the protocol: ``train``, ``test``, ``extra``.
         templates: Garments, each simulated separately; without outfits.
         outfits: Outfits of the tailor, in place of ``templates``; with the ``physxnet`` engine.
@@ -44,10 +43,9 @@ class DatasetConfig:
             the configuration because the last bits of a result depend on its batch.
         solver: Settings of this package's simulator.
         blender: Settings of Blender's simulator.
-        networks: Names or folders of weights whose mean prediction is stored.
     """
 
-    engine: Literal["physxnet", "blender", "network"] = "physxnet"
+    engine: Literal["physxnet", "blender"] = "physxnet"
     splits: tuple[str, ...] = ("train", "test")
     templates: tuple[Template, ...] = TEMPLATES
     outfits: tuple[Outfit, ...] = ()
@@ -61,7 +59,6 @@ class DatasetConfig:
     people: int = 1
     solver: XPBD = dataclasses.field(default_factory=XPBD)
     blender: BlenderSettings = dataclasses.field(default_factory=BlenderSettings)
-    networks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_numbers(self, "speed", "exaggerate")
@@ -81,15 +78,8 @@ class DatasetConfig:
             )
         if self.people > 1 and self.engine != "physxnet":
             raise ValueError(f"people is {self.people}; the engine '{self.engine}' takes 1.")
-        if (self.engine == "network") != bool(self.networks):
-            raise ValueError(
-                f"engine is '{self.engine}', networks is {self.networks}: set networks if and only"
-                " if engine is 'network'."
-            )
 
     def settings(self) -> dict[str, Any]:
         """Settings of the selected engine only."""
-        if self.engine == "network":
-            return {"engine": self.engine, "networks": list(self.networks)}
         used = self.solver if self.engine == "physxnet" else self.blender
         return {"engine": self.engine, **dataclasses.asdict(used)}

@@ -70,7 +70,6 @@ class Frames:
 
 def usable_garment(meta: dict) -> bool:
     """Whether a simulated garment stayed on the body."""
-    # Penetration isn't measured for a network's predictions, which can't come off.
     worst = meta["worst"]
     inside = worst.get("penetration_max", 0.0) <= MAX_PENETRATION
     return bool(meta["finite"]) and inside and worst.get("slipped", 0.0) <= OFF

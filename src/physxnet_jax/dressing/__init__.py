@@ -25,7 +25,6 @@ from ._dresser import (
     Precision as Precision,
     make_dresser as make_dresser,
     with_body as with_body,
-    with_shape as with_shape,
 )
 from ._export import EXPORTED as EXPORTED, export_dresser as export_dresser
 from ._inference import Inference as Inference
@@ -42,4 +41,9 @@ from ._simulate import (
     EXTERNAL_ENGINES as EXTERNAL_ENGINES,
     Simulation as Simulation,
     run_simulation as run_simulation,
+)
+from ._variations import (
+    with_cut as with_cut,
+    with_fabric as with_fabric,
+    with_shape as with_shape,
 )

@@ -93,9 +93,9 @@ class DressedClip:
 
 def dress(
     motion: Motion | Character | str | pathlib.Path,
-    wear: Wear = ("top", "bottom"),
+    wear: Wear = ("shirt", "trousers"),
     *,
-    method: Method = "network",
+    method: Method = "guided",
     inference: Inference | None = None,
     simulation: Simulation | None = None,
     fps: float | int = 30.0,
@@ -114,8 +114,8 @@ def dress(
             defines body, shape and frame rate.
         wear: Garments, garment files or template names, with options as in
             ``coat.obj:as=top,fabric=wool`` (see `Wear`).
-        method: ``network``, ``guided`` (a few substeps of simulation drawn to it), ``lbs``
-            (skinning alone) or ``simulate`` (the cloth simulator).
+        method: ``guided`` (a network, and a few substeps of simulation drawn to it), ``network``
+            (without those), ``lbs`` (skinning alone) or ``simulate`` (the cloth simulator).
         inference: Weights and post-processing of ``network`` and ``lbs``; ``collisions`` also
             apply to cloth simulated on a character.
         simulation: Options of ``simulate``, and effects and substeps of ``guided``.

@@ -32,8 +32,6 @@ from .postprocess import (
     prepare_collisions,
     prepare_layers,
     prepare_strain,
-    reshape_colliders,
-    reshape_strain,
 )
 
 Precision = Literal["float32", "bfloat16"]
@@ -89,7 +87,7 @@ class Dresser:
 
 @prepared_on_processor
 def make_dresser(
-    wear: Wear = ("top", "bottom"),
+    wear: Wear = ("shirt", "trousers"),
     *,
     method: Predicted = "network",
     inference: Inference | None = None,
@@ -237,60 +235,3 @@ def bind_to_predictor(
         return worn
     conditions = condition_maps(atlas, body, base, garment, binding)
     return dataclasses.replace(worn, modulation=predictor.modulation(garment.template, conditions))
-
-
-def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
-    """Changes the body shape of a dresser; pure, for `jax.vmap` and `jax.grad` over shapes.
-
-    Garments follow the shape as in `Garment.rest_vertices`. A single garment gives the same
-    result as `make_dresser` with the shape. With several garments, the clearance between
-    layers stays that of the previous shape.
-
-    Args:
-        dresser: From `make_dresser`.
-        shape: Shape parameters, see `Body.shape`.
-
-    Returns:
-        The dresser for that shape.
-
-    Raises:
-        ValueError: The number of parameters is wrong; or the cloth is simulated, or a network of
-            the ``paper`` family predicts a dress, whose offsets start from a body with joined
-            legs: use `make_dresser` with the shape instead.
-
-    Example:
-        >>> person = make_dresser(["bottom"])
-        >>> tall = with_shape(person, person.body.shape(height_up=0.5))
-        >>> bool(tall.worn[0].rest[:, 1].max() > person.worn[0].rest[:, 1].max())
-        True
-    """
-    if dresser.guided is not None:
-        raise ValueError("guided simulation: use make_dresser(..., shape=shape).")
-    body, predictor = dresser.body, dresser.predictor
-    rest = body.rest_vertices(shape)
-    worn: tuple[SkinnedGarment, ...] = tuple(
-        dataclasses.replace(w, rest=g.rest_vertices(rest))
-        for w, g in zip(dresser.worn, dresser.garments, strict=True)
-    )
-    if predictor is not None:
-        skirts = any(w.template == "dress" for w in worn)
-        if skirts and predictor.config.family == "paper":
-            raise ValueError("dresses of the paper family: use make_dresser(..., shape=shape).")
-        points = dataclasses.replace(
-            predictor.texel_points, rest=predictor.motion_atlas.at_texels(rest)
-        )
-        predictor = dataclasses.replace(predictor, texel_points=points)
-        worn = tuple(
-            dataclasses.replace(w, anchor=w.binding.to_body @ rest)
-            for w in worn
-            if isinstance(w, BoundGarment)
-        )
-    strain, colliders = dresser.strain, dresser.colliders
-    return dataclasses.replace(
-        dresser,
-        rest=rest,
-        predictor=predictor,
-        worn=worn,
-        strain=None if strain is None else reshape_strain(strain, worn),
-        colliders=None if colliders is None else reshape_colliders(colliders, body, rest),
-    )

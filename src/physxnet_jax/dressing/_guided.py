@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ..body import Body
 from ..errors import PhysXNetError
 from ..garment import SkinnedGarment, skin_garment
 from ..simulation import (
@@ -30,6 +31,7 @@ from .postprocess import (
     apply_contacts,
     prepare_collisions,
     prepare_layers,
+    reshape_colliders,
 )
 
 Posed = tuple[Float[Array, "_ 3"], ...]
@@ -74,6 +76,11 @@ class GuidedScene:
     def guide(self) -> PreparedGuide:
         """The effect that draws the cloth."""
         return next(e for e in self.system.effects if isinstance(e, PreparedGuide))
+
+    def with_system(self, system: System) -> "GuidedScene":
+        """The scene with changed materials or rest shapes."""
+        h = 1.0 / (_RATE * self.solver.substeps)
+        return dataclasses.replace(self, system=self.solver.at_step(system, h))
 
     def joined(self, cloth: Posed) -> Float[Array, "vertices 3 1"]:
         """All garments in the scene's order, from those of the dresser."""
@@ -148,6 +155,26 @@ def prepare_guided(
     )
 
 
+def reshape_guided(
+    scene: GuidedScene,
+    body: Body,
+    rest: Float[Array, "all 3"],
+    cloth: Posed,
+) -> GuidedScene:
+    """The scene for a body and garments of other rest shapes; pure, see `System.reshaped`.
+
+    Args:
+        scene: From `prepare_guided`.
+        body: The body.
+        rest: Its rest vertices [m].
+        cloth: Rest vertices of the dresser's garments [m].
+    """
+    new = scene.with_system(scene.system.reshaped(scene.joined(cloth)[:, :, 0], rest))
+    if scene.colliders is None:
+        return new
+    return dataclasses.replace(new, colliders=reshape_colliders(scene.colliders, body, rest))
+
+
 def _softness(rate: float) -> float:
     """Factor of bending for a number of substeps a second.
 
@@ -174,7 +201,8 @@ def init_guided(
         rotations: World rotations of joints in the frame before.
         translations: World translations of joints in the frame before [m].
     """
-    zero = jnp.zeros((scene.parts[-1], 3, 1), jnp.float32)
+    dtype = scene.system.inverse_mass.dtype
+    zero = jnp.zeros((scene.parts[-1], 3, 1), dtype)
     skin = skin_effects(scene.system, rotations[None], translations[None])
     return GuidedState(
         cloth=start_state(scene.system, zero, solver=scene.solver, fps=_RATE),
@@ -182,7 +210,7 @@ def init_guided(
         means=scene.guide.means(zero),
         rotations=rotations,
         translations=translations,
-        time=jnp.zeros((), jnp.float32),
+        time=jnp.zeros((), dtype),
         ready=jnp.zeros((), bool),
     )
 

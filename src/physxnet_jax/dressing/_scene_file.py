@@ -120,7 +120,7 @@ def _scene_keys(
 
 def make_scene(
     motion: str | pathlib.Path | Motion,
-    wear: Wear = ("top", "bottom"),
+    wear: Wear = ("shirt", "trousers"),
     *,
     simulation: Simulation | None = None,
     also: Sequence[Effect] = (),
@@ -282,7 +282,8 @@ def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, str]
     if text.get("accuracy", "standard") not in PRESETS:
         raise FormatError(f"{path}: accuracy is one of {', '.join(PRESETS)}.")
     words = [
-        {"file": g} if isinstance(g, str) else g for g in text.get("garments", ["top", "bottom"])
+        {"file": g} if isinstance(g, str) else g
+        for g in text.get("garments", ["trousers", "shirt"])
     ]
     for g in words:
         keys = set(g) if isinstance(g, dict) else {str(g)}

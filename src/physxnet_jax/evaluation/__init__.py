@@ -41,6 +41,7 @@ from ._cost_table import (
 from ._dataset_check import check_sequence as check_sequence
 from ._evaluate import (
     ActionError as ActionError,
+    action_name as action_name,
     evaluate as evaluate,
     means as means,
     retime as retime,

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..data import Sequence, usable_garment
+from ..data import Outfit, Sequence, Worn, usable_garment
 from ..dressing import (
     Dresser,
     Inference,
@@ -24,11 +24,11 @@ from ..dressing import (
     init_stream,
     make_dresser,
 )
-from ..garment import TEMPLATES, Template
-from ..models import Predictor, load_predictor, weights_size
+from ..garment import DEFAULT_KINDS, TEMPLATES, Template, tailor
+from ..models import BoundGarment, Predictor, load_predictor, weights_size
 from ..motion import BLOCK, Motion
-from ._method_names import method_name
-from ._methods import Method, network, skinning
+from ._method_names import GUIDED, method_name
+from ._methods import Guided, Method, network, skinning
 from ._metrics import vertex_error
 from ._saved_rows import weights_digest
 
@@ -41,11 +41,11 @@ class Cost:
     """Cost and error of one method.
 
     Attributes:
-        method: ``lbs``, ``network``, ``network+push``, ``simulator`` or ``engine``.
+        method: ``lbs``, ``network``, ``network+push``, ``guided``, ``simulator`` or ``engine``.
         size: Name of the weights, the simulator's accuracy or the engine.
         device: Kind of the device.
         batch: Frames per call; 1 is the streaming form, one frame in and one frame out.
-        garments: Number of garments, in the order top, bottom, dress.
+        garments: Number of garments, in the order shirt, trousers, A-line dress.
         rmse_mm: Mean over the test actions and these garments [mm]; NaN without data.
         ms_per_frame: Median of warm calls, from joint rotations to vertices [ms].
         ms_network: Part of it for the network, from features to maps [ms]; 0 without one.
@@ -54,8 +54,8 @@ class Cost:
             if it wasn't requested.
         cold_s: Time of the first call, including compilation [s].
         params: Number of the network's parameters, with batch norm folded.
-        flops: FLOPs of a call as counted by the compiler; NaN with collision resolution
-            or strain limiting, because the compiler counts a loop's body once.
+        flops: FLOPs of a call as counted by the compiler; NaN with collision resolution, strain
+            limiting or a simulation, because the compiler counts a loop's body once.
         weights_mb: Size of the weights' file [MB].
         peak_mb: Memory of a call: arguments, results and temporaries [MB].
         backward_mb: Memory of a call of the gradient [MB].
@@ -119,6 +119,7 @@ def network_costs(
     garments: Items[int] = (1, 2, 3),
     backward: bool = False,
     precision: Precision = "float32",
+    guided: bool = False,
 ) -> Iterator[Cost]:
     """Costs of a network on the default device, without and with collision resolution.
 
@@ -126,25 +127,28 @@ def network_costs(
         inference: Weights and strain limiting; costs without and with collision
             resolution are measured whatever it requests.
         motion: The motion; repeated if it is shorter than a batch.
-        errors: For ``network`` and ``network+push``, the mean error by template [mm].
+        errors: For ``network`` and ``network+push``, or ``guided``, the mean error by template
+            [mm].
         batches: Frames per call.
         garments: Numbers of garments worn together.
         backward: Measure gradients as well.
         precision: Precision of the network's arithmetic.
+        guided: Measure the guided simulation instead.
 
     Yields:
         A row for each method, number of garments and batch.
     """
     weights = str(inference.weights)
     bare = dataclasses.replace(inference, collisions=False)
-    size = pathlib.Path(method_name(bare)).name
+    size = pathlib.Path(str(weights) + GUIDED if guided else method_name(bare)).name
     predictor = load_predictor(weights)
     params = sum(x.size for x in jax.tree.leaves(predictor.state))
-    for collisions in (False, True):
-        method = "network+push" if collisions else "network"
+    for collisions in (False,) if guided else (False, True):
+        method = "guided" if guided else "network+push" if collisions else "network"
         for number in garments:
             dresser = make_dresser(
-                TEMPLATES[:number],
+                [tailor(DEFAULT_KINDS[t]) for t in TEMPLATES[:number]],
+                method="guided" if guided else "network",
                 inference=dataclasses.replace(inference, weights=predictor, collisions=collisions),
                 precision=precision,
             )
@@ -201,7 +205,8 @@ def other_costs(
     times, colds = [], []
     for t in TEMPLATES:
         began = time.perf_counter()
-        times.append(method(motion, t).ms_per_frame)
+        worn = Worn(outfit=Outfit(wear=(DEFAULT_KINDS[t],)), template=t)
+        times.append(method(motion, worn).ms_per_frame)
         colds.append(time.perf_counter() - began)
         yield Cost(
             kind,
@@ -246,8 +251,11 @@ def network_errors(
     sequences: Items[Sequence],
     *,
     precision: Precision = "float32",
+    guided: bool = False,
 ) -> dict[str, dict[Template, float]]:
-    """`mean_errors` of a network without and with collision resolution."""
+    """`mean_errors` of a network without and with collision resolution, or guiding."""
+    if guided:
+        return {"guided": mean_errors(Guided(inference), sequences, TEMPLATES)}
     return {
         name: mean_errors(
             network(dataclasses.replace(inference, collisions=collisions), precision),
@@ -302,7 +310,7 @@ def clothing_cost(
 
 
 def _without_loops(dresser: Dresser) -> bool:
-    return dresser.colliders is None and dresser.strain is None
+    return dresser.colliders is None and dresser.strain is None and dresser.guided is None
 
 
 def _gradient(dresser: Dresser, motion: Motion, batch: int) -> dict[str, float]:
@@ -330,8 +338,10 @@ def _network(dresser: Dresser, batch: int) -> float:
     features = jnp.zeros(
         (batch, predictor.texel_points.rest.shape[0], predictor.config.inputs.channels), jnp.float32
     )
-    run = jax.jit(lambda n, x: n.from_features(x, templates))
-    return _median(lambda: run(predictor, features)) / batch
+    worn = {w.template: w.modulation for w in dresser.worn if isinstance(w, BoundGarment)}
+    known = {t: m for t, m in worn.items() if m is not None} or None
+    run = jax.jit(lambda n, x, m: n.from_features(x, templates, m))
+    return _median(lambda: run(predictor, features, known)) / batch
 
 
 def _predictor_of(dresser: Dresser) -> Predictor:

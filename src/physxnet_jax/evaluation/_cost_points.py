@@ -8,7 +8,7 @@ from ._cost import Cost
 
 def cost_points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
     """Points of the diagram: a panel for each number of garments, a line for each method."""
-    panels = {r.garments for r in rows if r.method.startswith("network")}
+    panels = {r.garments for r in rows if r.method.startswith(("network", "guided"))}
     several = len({r.device for r in rows}) > 1
     out = []
     for r in rows:
@@ -17,7 +17,7 @@ def cost_points(rows: Sequence[Cost]) -> list[tuple[str, str, float, float]]:
         name = r.method if r.precision == "float32" else f"{r.method} {r.precision}"
         # A network of another family isn't a size of the same one: it gets its own line.
         name = f"{name} (paper)" if r.size == "paper" else name
-        if r.method.startswith("network"):
+        if r.method.startswith(("network", "guided")):
             name += ", live" if r.batch == 1 else f", {r.batch} frames"
         if several:
             name += f", {r.device}"

@@ -9,15 +9,16 @@ from typing import Any
 
 from .._environment import cache_folder
 from .._version import __version__
+from ..data import Outfit, Worn
 from ..dressing import Inference, Simulation, make_dresser
 from ..errors import PhysXNetError
 from ..files import atomic_write
-from ..garment import TEMPLATES, Template
+from ..garment import DEFAULT_KINDS, TEMPLATES, Template, tailor
 from ..models import read_card
 from ..motion import BLOCK, Motion, load_motion
 from ..simulation import PRESETS
 from ._cost import clothing_cost
-from ._method_names import PUSH, RELAX, method_by_name, parse_method
+from ._method_names import GUIDED, PUSH, RELAX, method_by_name, parse_method
 from ._saved_rows import machine
 
 _FRAMES = 64
@@ -26,7 +27,7 @@ _SECONDS = 0.5
 # Attempts to time a post-processing step whose measured cost isn't positive.
 _ATTEMPTS = 4
 # Times with another value of this marker were measured differently and are discarded.
-_TIMING_VERSION = "garments together, relaxed"
+_TIMING_VERSION = "tailored garments together"
 ALONE_AND_TOGETHER: tuple[tuple[Template, ...], ...] = (*((t,) for t in TEMPLATES), TEMPLATES)
 """Each template alone, and all of them together."""
 
@@ -37,9 +38,10 @@ class MethodProfile:
 
     Attributes:
         name: ``lbs``, a name of weights, optionally with one or more of ``+mirror``,
-            ``+relax`` and ``+push``, or an accuracy of the simulator.
+            ``+relax`` and ``+push`` or with ``+guided``, or an accuracy of the simulator.
         rmse_mm: Root mean square distance of vertices from the simulation at its
-            ``standard`` setting [mm], by template.
+            ``standard`` setting [mm], by template: of the shirt, the trousers and the A-line
+            dress.
         inside: Share of vertices inside the body by template, pinched ones excluded.
     """
 
@@ -54,6 +56,9 @@ class MethodProfile:
             return {"method": "lbs", "inference": Inference(collisions=False)}
         if self.name in PRESETS:
             return {"method": "simulate", "simulation": Simulation(accuracy=self.name)}  # pyright: ignore[reportArgumentType]
+        if self.name.endswith(GUIDED):
+            weights = parse_method(self.name).weights
+            return {"method": "guided", "inference": Inference(weights=weights)}
         return {"method": "network", "inference": parse_method(self.name)}
 
     @property
@@ -151,14 +156,15 @@ class _Clock:
         return known[key]
 
     def _measure(self, profile: MethodProfile, templates: Sequence[Template]) -> float:
-        if profile.options["method"] != "network":
+        if profile.options["method"] not in ("network", "guided"):
             # These dress one garment at a time.
             method = method_by_name(profile.name)
-            return sum(method(self._walk, t).ms_per_frame for t in templates)
+            worn = (Worn(outfit=Outfit(wear=(DEFAULT_KINDS[t],)), template=t) for t in templates)
+            return sum(method(self._walk, w).ms_per_frame for w in worn)
         # Post-processing costs the same for all networks: it is timed with the first one.
         last = next((w for w in (PUSH, RELAX) if profile.name.endswith(w)), None)
         if last is None:
-            return self._network(profile, templates)
+            return self._together(profile, templates)
         without_last = dataclasses.replace(profile, name=profile.name.removesuffix(last))
         plain = self.time_of(without_last, templates)
         known = self.times.setdefault(last, {})
@@ -166,8 +172,8 @@ class _Clock:
         if key not in known:
             for _ in range(_ATTEMPTS):
                 # Time both now: the machine's speed may have changed since the other was timed.
-                total = self._network(profile, templates)
-                extra = total - self._network(without_last, templates)
+                total = self._together(profile, templates)
+                extra = total - self._together(without_last, templates)
                 if extra > 0.0:
                     break
             else:
@@ -176,8 +182,9 @@ class _Clock:
             self._store(known, key, extra)
         return plain + known[key]
 
-    def _network(self, profile: MethodProfile, templates: Sequence[Template]) -> float:
-        dresser = make_dresser(templates, inference=profile.options["inference"])
+    def _together(self, profile: MethodProfile, templates: Sequence[Template]) -> float:
+        garments = [tailor(DEFAULT_KINDS[t]) for t in templates]
+        dresser = make_dresser(garments, **profile.options)
         return clothing_cost(dresser, self._walk, BLOCK, seconds=_SECONDS)["ms_per_frame"]
 
     def _store(self, known: dict[str, float], key: str, ms: float) -> None:

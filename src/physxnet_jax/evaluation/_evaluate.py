@@ -274,6 +274,11 @@ class _ReferenceTables:
         return ActionError(**values)
 
 
+def action_name(row: ActionError) -> str:
+    """The action of a row, without the number of the outfit that a sequence's name ends with."""
+    return row.action.partition(" #")[0]
+
+
 def means(rows: Items[ActionError], method: str, name: str, engine: str) -> dict[str, float] | None:
     """Means over the actions of a method on a template; None if there is no row."""
     mine = [r for r in rows if (r.method, r.template, r.engine) == (method, name, engine)]

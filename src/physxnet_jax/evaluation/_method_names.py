@@ -12,8 +12,9 @@ from ..models import load_predictor
 from ..simulation import PRESETS
 from ._methods import PERTURBATION, Guided, Method, Simulator, external_engine, network, skinning
 
-MIRROR, RELAX, PUSH = "+mirror", "+relax", "+push"
-"""Suffixes of rows: test-time augmentation, strain limiting, collision resolution."""
+MIRROR, RELAX, PUSH, GUIDED = "+mirror", "+relax", "+push", "+guided"
+"""Suffixes of rows: test-time augmentation, strain limiting, collision resolution, guided
+simulation."""
 _SIMULATED = re.compile(r"\+(guided|unguided)(\d*)$")
 
 
@@ -48,7 +49,7 @@ def method_name(inference: Inference) -> str:
 
     Example:
         >>> method_name(Inference())
-        'local+relax+push'
+        'base+relax+push'
     """
     return "".join(
         (

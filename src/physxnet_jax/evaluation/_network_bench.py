@@ -23,8 +23,10 @@ from ._cost import (
     other_costs,
     present_devices,
 )
-from ._method_names import PUSH, method_by_name, parse_method
+from ._method_names import GUIDED, PUSH, method_by_name, parse_method
 from ._saved_rows import check_rows_file, read_rows, recorded_machine, save_rows, weights_digest
+
+_NETWORKS = ("network", "guided")
 
 Errors = Mapping[str, Mapping[Template, float]]
 """Mean errors [mm] by method and template."""
@@ -35,7 +37,7 @@ class NetworkBench:
     """What `bench_networks` measures.
 
     Attributes:
-        weights: Names or folders of weights, or runs.
+        weights: Names or folders of weights, or runs, with suffixes as in `parse_method`.
         simulators: Accuracies of the simulator, ``perturbed``, and external engines.
         precisions: Precisions of the networks' arithmetic.
         batches: Frames per call of a network.
@@ -43,7 +45,7 @@ class NetworkBench:
         backward: Measure gradients as well.
     """
 
-    weights: tuple[str, ...] = ("local",)
+    weights: tuple[str, ...] = ("base",)
     simulators: tuple[str, ...] = ()
     precisions: tuple[Precision, ...] = ("float32",)
     batches: tuple[int, ...] = (1, 32)
@@ -88,7 +90,7 @@ def bench_networks(
     jobs.extend(
         ("engine" if s in EXTERNAL_ENGINES else "simulator", s, plain) for s in plan.simulators
     )
-    jobs.extend(("network", w, p) for w in plan.weights for p in plan.precisions)
+    jobs.extend((_kind(w), w, p) for w in plan.weights for p in plan.precisions)
     here = present_devices()
     # External engines run in their own process, on the CPU.
     work = [(d, *job) for job in jobs for d in (here[-1:] if job[0] == "engine" else here)]
@@ -106,7 +108,7 @@ def bench_networks(
                 rows = [r for r in rows if r not in known]
                 rows += [_with_errors(r, known) for r in retimed]
             else:
-                for part in _unmeasured(plan, known) if kind == "network" or not known else ():
+                for part in _unmeasured(plan, known) if kind in _NETWORKS or not known else ():
                     new = list(_measure(kind, size, precision, part, tests, evaluated))
                     # A row without the gradient gives way to the one with it.
                     replaced = set(map(_key, new))
@@ -117,6 +119,10 @@ def bench_networks(
         save_rows(out, rows, recorded)
     report("methods", len(work), len(work))
     return rows
+
+
+def _kind(weights: str) -> str:
+    return "guided" if weights.endswith(GUIDED) else "network"
 
 
 def evaluated_errors(path: pathlib.Path) -> Errors:
@@ -218,7 +224,8 @@ def _with_errors(row: Cost, known: Sequence[Cost]) -> Cost:
 
 def _sort_key(row: Cost) -> tuple[object, ...]:
     """Sort key of a row, independent of the order of measurement."""
-    place = ("lbs", "simulator", "engine", "network").index(row.method.removesuffix(PUSH))
+    order = ("lbs", "simulator", "engine", *_NETWORKS)
+    place = order.index(row.method.removesuffix(PUSH))
     # From coarse to fine: the diagram joins the points in this order.
     finer = [*PRESETS].index(row.size) if row.size in PRESETS else -1
     which = row.size, row.precision, row.device, row.method
@@ -234,7 +241,7 @@ def _measure(
     evaluated: Errors,
 ) -> Iterator[Cost]:
     walk = load_motion("walk", fps=30.0)
-    if kind != "network":
+    if kind not in _NETWORKS:
         name = "lbs" if kind == "lbs" else size
         method = method_by_name(name)
         errors = evaluated.get(name)
@@ -244,10 +251,13 @@ def _measure(
         return
     inference = parse_method(size)
     # `evaluate` runs the networks in float32.
-    variants = ("network", size), (f"network{PUSH}", f"{size}{PUSH}")
+    guided = kind == "guided"
+    variants = [("network", size), (f"network{PUSH}", f"{size}{PUSH}")]
+    if guided:
+        variants = [("guided", size)]
     found = {w: evaluated[n] for w, n in variants if precision == "float32" and n in evaluated}
     if len(found) < len(variants):
-        found = network_errors(inference, tests, precision=precision)
+        found = network_errors(inference, tests, precision=precision, guided=guided)
     for row in network_costs(
         inference,
         walk,
@@ -256,5 +266,6 @@ def _measure(
         garments=plan.garments,
         backward=plan.backward,
         precision=precision,
+        guided=guided,
     ):
         yield dataclasses.replace(row, size=pathlib.Path(size).name)

@@ -5,7 +5,7 @@ from collections.abc import Sequence as Items
 
 from ._bench import Work, time_to_error
 from ._cost import Cost
-from ._evaluate import ActionError, means
+from ._evaluate import ActionError, action_name, means
 
 
 def summary_table(rows: Items[ActionError]) -> str:
@@ -104,10 +104,11 @@ def _actions(rows: Items[ActionError], name: str) -> list[str]:
     mine = [r for r in rows if r.template == name]
     methods = list(dict.fromkeys(r.method for r in mine))
     lines = ["| action | " + " | ".join(methods) + " |", "|---" * (len(methods) + 1) + "|"]
-    for action in dict.fromkeys(r.action for r in mine):
+    for action in dict.fromkeys(action_name(r) for r in mine):
         cells = []
         for method in methods:
-            found = [r.rmse_vertices_mm for r in mine if (r.action, r.method) == (action, method)]
+            here = [r for r in mine if (action_name(r), r.method) == (action, method)]
+            found = [r.rmse_vertices_mm for r in here]
             cells.append(f"{found[0]:.1f}" if found else "")
         lines.append(f"| {action} | " + " | ".join(cells) + " |")
     return lines

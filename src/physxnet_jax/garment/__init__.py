@@ -53,6 +53,7 @@ from ._wear import (
     with_fabric as with_fabric,
 )
 from .tailoring import (
+    DEFAULT_KINDS as DEFAULT_KINDS,
     KINDS as KINDS,
     MEASURES as MEASURES,
     Kind as Kind,

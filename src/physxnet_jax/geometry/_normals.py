@@ -50,7 +50,7 @@ def vertex_normals(
         u = safe_normalize(corners[(i + 1) % 3] - corners[i])
         w = safe_normalize(corners[(i + 2) % 3] - corners[i])
         # Half-angle form: acos would have an infinite slope on slivers.
-        angle = 2.0 * jnp.arctan2(_length(u - w), jnp.maximum(_length(u + w), jnp.float32(1e-6)))
+        angle = 2.0 * jnp.arctan2(_length(u - w), jnp.maximum(_length(u + w), 1e-6))
         out = out.at[..., faces[:, i], :].add(angle[..., None] * normal)
     return safe_normalize(out)
 

@@ -18,7 +18,6 @@ from ._features import (
     point_features as point_features,
 )
 from ._fold import at_precision as at_precision, fold_batch_norm as fold_batch_norm
-from ._mean import average_networks as average_networks
 from ._networks import (
     Discriminator as Discriminator,
     Generator as Generator,
@@ -39,7 +38,6 @@ from ._weights import (
     list_weights as list_weights,
     load_predictor as load_predictor,
     read_card as read_card,
-    save_mean as save_mean,
     save_predictor as save_predictor,
     weights_size as weights_size,
 )

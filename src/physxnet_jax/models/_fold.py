@@ -9,7 +9,6 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from ._blocks import Down, Up, upsample, upsampling_kernel
-from ._mean import MeanGenerator
 from ._networks import Generator
 from ._predictor import Predictor
 
@@ -46,15 +45,13 @@ def fold_batch_norm(predictor: Predictor) -> Predictor:
     The result can be differentiated but isn't meant to be trained or saved.
 
     Args:
-        predictor: A predictor. Only a `Generator`, or an average of several, is folded; any
-            other module passes through.
+        predictor: A predictor. Only a `Generator` is folded; any other module passes through.
 
     Returns:
         The folded predictor; predictions differ by rounding alone.
     """
     network = nnx.merge(predictor.graph, predictor.state, copy=True)
-    for one in network.networks if isinstance(network, MeanGenerator) else (network,):
-        _fold(one)
+    _fold(network)
     graph, state = nnx.split(network)
     return dataclasses.replace(predictor, graph=graph, state=state)
 

@@ -89,7 +89,8 @@ class Decoder(nnx.Module):
             if modulation is not None:
                 scale, shift = modulation[k]
                 x = x + (x * scale.astype(x.dtype) + shift.astype(x.dtype))
-            x = jnp.where(x > 0, x, 0.0)
+            # What isn't finite stays so: cloth mustn't pass for good where motion was lost.
+            x = jnp.where(x <= 0, 0.0, x)
             if k < LEVELS - 1:
                 x = jnp.concatenate([x, features[LEVELS - 2 - k]], axis=-1)
         return x

@@ -216,7 +216,7 @@ class Predictor:
         return {
             t: jnp.where(
                 self.texel_points.valid[t][None, :, None],
-                self._texel_values(m, t).astype(jnp.float32) * self.normalisation.offset[t],
+                self._texel_values(m, t).astype(features.dtype) * self.normalisation.offset[t],
                 0.0,
             )
             for t, m in out.items()
@@ -283,7 +283,7 @@ def normalise(
     fast motion instead of an input far outside the training range. Finite features stay finite,
     and so do gradients.
     """
-    one = jnp.ones((), jnp.float32)
+    one = jnp.ones((), features.dtype)
     scales = {"velocity": normalisation.velocity, "acceleration": normalisation.acceleration}
     out, start = [], 0
     for kind in inputs.kinds:

@@ -5,7 +5,6 @@ import hashlib
 import importlib.resources
 import json
 import pathlib
-from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -19,7 +18,6 @@ from ..errors import WeightsError
 from ..files import atomic_write
 from ..uv import make_atlas
 from ._features import FeatureConfig
-from ._mean import MeanGenerator, average_networks
 from ._networks import Generator
 from ._predictor import (
     ModelConfig,
@@ -29,7 +27,7 @@ from ._predictor import (
     make_texel_points,
 )
 
-DEFAULT = "local"
+DEFAULT = "base"
 """Name of the default weights."""
 _TENSORS, _CARD = "weights.safetensors", "card.json"
 _PACKAGED = pathlib.Path(str(importlib.resources.files(__package__ or "") / "weights"))
@@ -51,13 +49,11 @@ def save_predictor(
         card: Further entries of the card: data, licence, measured table.
 
     Raises:
-        WeightsError: The predictor can't be saved: its network is an average, its batch norm
-            is folded, or it uses test-time augmentation. Or parameters exceed half precision.
+        WeightsError: The predictor can't be saved: its batch norm is folded, or it uses
+            test-time augmentation. Or parameters exceed half precision.
     """
     folder = pathlib.Path(folder)
     network = nnx.merge(predictor.graph, predictor.state)
-    if isinstance(network, MeanGenerator):
-        raise WeightsError(f"{name}: an average of networks isn't saved; save the networks.")
     custom = None if isinstance(network, Generator) else type(network).__qualname__
     plain = nnx.eval_shape(lambda: make_generator(predictor.config))
     same = jax.tree.structure(nnx.state(network)) == jax.tree.structure(nnx.state(plain))
@@ -101,27 +97,6 @@ def save_predictor(
             part.write_bytes(data)
 
 
-def save_mean(
-    folder: str | pathlib.Path, parts: Sequence[str], *, card: dict[str, Any] | None = None
-) -> None:
-    """Writes the card of an average of packaged networks; it has no tensors.
-
-    Args:
-        folder: Folder for ``card.json``; its name becomes the name of the average.
-        parts: Names of `list_weights`.
-        card: Further entries of the card: licence, measured table.
-    """
-    folder = pathlib.Path(folder)
-    digest = _digest([read_card(p) for p in parts])
-    info = {"name": folder.name, "mean_of": list(parts), "sha256": digest, **(card or {})}
-    with atomic_write(folder / _CARD) as part:
-        part.write_text(json.dumps(info, indent=1))
-
-
-def _digest(cards: Sequence[dict[str, Any]]) -> str:
-    return hashlib.sha256("".join(c["sha256"] for c in cards).encode()).hexdigest()
-
-
 def list_weights() -> list[str]:
     """Names of the packaged weights."""
     if not _PACKAGED.is_dir():
@@ -151,11 +126,11 @@ def weights_size(weights: str | pathlib.Path = DEFAULT) -> int:
     Raises:
         WeightsError: Unknown name, invalid card or missing tensors.
     """
-    folder = _folder(weights)
-    files = [f / _TENSORS for f in _parts(read_card(weights)) or [folder]]
-    if missing := [f for f in files if not f.is_file()]:
-        raise WeightsError(f"{missing[0]}: no such file. Reinstall or copy it again.")
-    return sum(f.stat().st_size for f in files)
+    read_card(weights)
+    path = _folder(weights) / _TENSORS
+    if not path.is_file():
+        raise WeightsError(f"{path}: no such file. Reinstall or copy it again.")
+    return path.stat().st_size
 
 
 def load_predictor(
@@ -194,26 +169,10 @@ def _model(card: dict[str, Any]) -> ModelConfig:
     )
 
 
-def _parts(card: dict[str, Any]) -> list[pathlib.Path]:
-    """Folders of the packaged networks that a card averages; empty for most cards."""
-    members = card.get("mean_of", ())
-    named = members if isinstance(members, list) else []
-    return [_PACKAGED / name for name in named if name in list_weights()]
-
-
 def _load(
     weights: str | pathlib.Path, folder: pathlib.Path, custom: nnx.Module | None = None
 ) -> Predictor:
     card = json.loads((folder / _CARD).read_text())
-    if "mean_of" in card:
-        parts = _parts(card)
-        members = [json.loads((p / _CARD).read_text()) for p in parts]
-        if _digest(members) != card["sha256"] or any("mean_of" in c for c in members):
-            raise WeightsError(
-                f"{weights}: {', '.join(map(str, card['mean_of']))} aren't the networks of this"
-                " card. Reinstall the package."
-            )
-        return average_networks([_load(p.name, p) for p in parts])
     blob = (folder / _TENSORS).read_bytes()
     digest = hashlib.sha256(blob).hexdigest()
     if digest != card["sha256"]:

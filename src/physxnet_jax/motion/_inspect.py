@@ -146,7 +146,7 @@ def inspect_motion(
         )
     out = f"{motion if str(motion) in CLIPS else pathlib.Path(motion).stem}.usdc"
     words = ["physxnet", "dress", shlex.quote(str(motion)), *options]
-    words += ["--wear", "top", "bottom", "-o", shlex.quote(out)]
+    words += ["--wear", "shirt", "trousers", "-o", shlex.quote(out)]
     return MotionInspection(
         path=str(motion),
         frames=clip.num_frames,

@@ -28,6 +28,7 @@ class Assembly:
         stretch: Membrane stiffness of faces [N/m], shape [faces].
         bend: Bending stiffness of faces [N m], shape [faces].
         membrane: Stiffness along warp, weft and in shear [N/m], shape [faces, 3].
+        density: Mass per area of faces [kg/m^2], shape [faces].
         loose: Vertices that may touch any limb (skirts), shape [vertices].
         parts: First vertex of each garment, followed by the number of vertices.
         coarse_faces: Triangles of the meshes that garments refine, shape [coarse, 3].
@@ -47,6 +48,7 @@ class Assembly:
     stretch: Float[np.ndarray, " faces"]
     bend: Float[np.ndarray, " faces"]
     membrane: Float[np.ndarray, "faces 3"]
+    density: Float[np.ndarray, " faces"]
     loose: Bool[np.ndarray, " vertices"]
     parts: tuple[int, ...]
     coarse_faces: Int[np.ndarray, "coarse 3"]
@@ -63,7 +65,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
     rest_body = body.rest_vertices(shape)
     rest, faces, mass, pinned, weights = [], [], [], [], []
     per_vertex: dict[str, list] = {"thickness": [], "friction": []}
-    per_face: dict[str, list] = {"stretch": [], "bend": [], "membrane": []}
+    per_face: dict[str, list] = {"stretch": [], "bend": [], "membrane": [], "density": []}
     loose, coarse, bands = [], [np.zeros((0, 3), np.int64)], [np.zeros((0, 2), np.int64)]
     parts, holds = [0], []
     for g in garments:
@@ -93,6 +95,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         per_face["stretch"].append(np.full(len(f), g.fabric.stretch))
         per_face["bend"].append(np.full(len(f), g.fabric.bend))
         per_face["membrane"].append(np.tile(g.fabric.membrane, (len(f), 1)))
+        per_face["density"].append(np.full(len(f), g.fabric.density))
         holds.append(tuple(c + parts[-1] for c in holding_loops(g).values()))
         loose.append(_loose_vertices(g, x, np.asarray(rest_body, np.float64)))
         parts.append(parts[-1] + len(x))
@@ -110,12 +113,32 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         cat(per_face["stretch"]),
         cat(per_face["bend"]),
         cat(per_face["membrane"]),
+        cat(per_face["density"]),
         cat(loose),
         tuple(parts),
         cat(coarse),
         cat(bands),
         tuple(holds),
     )
+
+
+def norm(x: Float[Array, "... 3"]) -> Float[Array, "..."]:
+    """Lengths, whose gradient is zero where they are."""
+    squared = jnp.sum(x * x, axis=-1)
+    safe = jnp.where(squared > 0.0, squared, 1.0)
+    return jnp.where(squared > 0.0, jnp.sqrt(safe), 0.0)
+
+
+def vertex_masses(
+    rest: Float[Array, "vertices 3"],
+    faces: Int[Array, "faces 3"],
+    density: Float[Array, " faces"],
+) -> Float[Array, " vertices"]:
+    """Masses of vertices [kg], as `assemble` has them, as a function of the rest positions."""
+    a, b, c = (rest[faces[:, k]] for k in range(3))
+    share = density * norm(jnp.cross(b - a, c - a)) / 6.0
+    mass = jnp.zeros(len(rest), rest.dtype).at[faces].add(share[:, None])
+    return jnp.maximum(mass, 1e-3 * jnp.maximum(jnp.mean(mass), 1e-9))
 
 
 def float32(x: np.ndarray) -> Array:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..errors import SimulationError
 from ..typing import pytree
 from ._assembly import Assembly
 
@@ -67,6 +68,22 @@ class Step(NamedTuple):
     share: float
 
 
+class Rest(NamedTuple):
+    """The rest state of a scene, see `System.reshaped`.
+
+    Attributes:
+        cloth: Vertices of all garments [m].
+        body: Vertices of the body [m].
+        normals: Unit normals of the skin's vertices.
+        inverse_mass: Inverse masses of the cloth's vertices [1/kg].
+    """
+
+    cloth: Float[Array, "vertices 3"]
+    body: Float[Array, "all 3"]
+    normals: Float[Array, "skin 3"]
+    inverse_mass: Float[Array, " vertices"]
+
+
 class Prepared:
     """An effect prepared for a scene: a pytree whose hooks do nothing by default.
 
@@ -93,6 +110,17 @@ class Prepared:
     def rescaled(self, factors: Mapping[str, Any]) -> "Prepared":
         """The effect with scaled material parameters, see `System.rescaled`."""
         return self
+
+    def reshaped(self, rest: Rest) -> "Prepared":
+        """The effect for another rest state, see `System.reshaped`.
+
+        Raises:
+            SimulationError: The effect's tables can't be changed.
+        """
+        raise SimulationError(
+            f"The effect {type(self).__name__.lstrip('_')} can't be reshaped; prepare the scene"
+            " anew."
+        )
 
     def at_step(self, h: float) -> "Prepared":
         """The effect with tables for implicit substeps of ``h`` [s], for `project`."""

@@ -146,6 +146,8 @@ def make_system(scene: PreparedScene, solver: Solver) -> System:
         float32(scene.assembly.rest_body),
         scene.effects,
         scene.inverse_mass,
+        jnp.asarray(scene.assembly.faces.astype(np.int32)),
+        float32(scene.assembly.density),
         solver.prepare(scene),
     )
     return cast(system, solver.precision)

@@ -6,12 +6,14 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
-from ..body import Body, blend_rotations
+from ..body import NUM_BODY_VERTICES, Body, blend_rotations, triangulate
 from ..errors import SimulationError
+from ..geometry import vertex_normals
 from ..typing import pytree
-from ._effect import PosedPoints, Prepared, SkinnedPoints
+from ._assembly import vertex_masses
+from ._effect import PosedPoints, Prepared, Rest, SkinnedPoints
 
 # Same precision as the skinning of the body.
 _EXACT = jax.lax.Precision.HIGHEST
@@ -45,6 +47,8 @@ class System:
         rest: Rest vertices of the body [m], shape [all, 3].
         effects: Prepared effects, in their order of application.
         inverse_mass: Inverse masses [1/kg], 0 for held vertices, shape [vertices, 1, 1].
+        faces: Triangles of the cloth, shape [faces, 3].
+        density: Their mass per area [kg/m^2], shape [faces].
         extra: The solver's tables, see `Solver.prepare`.
     """
 
@@ -52,6 +56,8 @@ class System:
     rest: Float[Array, "all 3"]
     effects: tuple[Prepared, ...]
     inverse_mass: Float[Array, "vertices 1 1"]
+    faces: Int[Array, "faces 3"]
+    density: Float[Array, " faces"]
     extra: Any = None
 
     def rescaled(self, **factors: Float[Array, ""] | float) -> "System":
@@ -86,6 +92,35 @@ class System:
         # The solver's tables may depend on the materials.
         extra = self.extra.rescaled(effects) if hasattr(self.extra, "rescaled") else self.extra
         return dataclasses.replace(self, effects=effects, extra=extra)
+
+    def reshaped(self, cloth: Float[Array, "vertices 3"], rest: Float[Array, "all 3"]) -> "System":
+        """The scene with cloth of other measures on a body of another shape, differentiable.
+
+        Lengths, areas, masses and the skin change; what was searched for when the scene was
+        prepared stays: the patches of the skin that contact compares, and how much higher large
+        triangles lie above features of the skin. Those depend on shape but little.
+
+        Args:
+            cloth: Rest positions of all garments' vertices [m], of the same meshes.
+            rest: Rest vertices of the body [m].
+
+        Raises:
+            SimulationError: An effect of the scene, or its solver, can't be reshaped.
+        """
+        if self.extra is not None:
+            raise SimulationError("This solver has tables of its own; prepare the scene anew.")
+        mass = vertex_masses(cloth, self.faces, self.density)
+        held = self.inverse_mass[:, 0, 0] == 0.0
+        inverse = jnp.where(held, 0.0, 1.0 / mass)
+        faces = triangulate(self.body.quads)
+        normals = vertex_normals(rest[:NUM_BODY_VERTICES], jnp.asarray(faces))
+        new = Rest(cloth, rest, normals, inverse)
+        return dataclasses.replace(
+            self,
+            rest=rest,
+            effects=tuple(e.reshaped(new) for e in self.effects),
+            inverse_mass=inverse[:, None, None],
+        )
 
 
 def _check_factor(name: str, factor: Any) -> None:

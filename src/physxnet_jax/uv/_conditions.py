@@ -55,6 +55,8 @@ def condition_maps(
         stretch, density and friction over those of cotton.
     """
     vertices, faces = np.asarray(garment.mesh.vertices, np.float64), np.asarray(garment.mesh.faces)
+    # A triangle that names a vertex twice has an edge that would pass for a border.
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     beneath = _points_beneath(atlas, body, rest, garment, binding)
     fabric = _fabric(garment.fabric)
     values = np.column_stack(

@@ -1,6 +1,7 @@
 """Visualisation of results: pictures, videos, and a page in the browser."""
 
-from ._diagram import draw_bars as draw_bars, draw_work_precision as draw_work_precision
+from ._diagram import draw_work_precision as draw_work_precision
+from ._error_report import write_error_report as write_error_report
 from ._job import Choice as Choice, run_job as run_job
 from ._maps import magnified as magnified, texel_picture as texel_picture
 from ._record import record as record

@@ -15,19 +15,20 @@ from .._environment import clear_caches_if_full
 from ..body import load_body
 from ..dressing import (
     INFERENCE_STAGES,
+    Dresser,
     Inference,
     Simulation,
     animated_meshes,
     dress,
+    make_dresser,
     make_scene,
     run_simulation,
-    with_body,
 )
 from ..errors import PhysXNetError
 from ..evaluation import load_cost_table, method_name, parse_method
 from ..garment import FABRICS, with_default_fabric
 from ..io import AnimatedMesh
-from ..models import Predictor, load_predictor, read_card
+from ..models import read_card
 from ..motion import BLOCK, Motion, clip_transforms, prepare_motion, stand_on_floor
 from ._live import Live
 from ._maps import frame_maps
@@ -49,7 +50,7 @@ class Choice:
         shape: Shape parameters by name; none for the default shape.
         simulation: Options of the simulator. The reference is always ``standard``, on which
             the networks were trained.
-        fabric: Fabric of simulated garments that specify none.
+        fabric: Fabric of garments that specify none.
         frames: Maximum number of frames.
         fps: Frames per second.
         source_fps: True rate of a motion file [1/s], if its header is wrong or lacks it.
@@ -58,8 +59,8 @@ class Choice:
     """
 
     motion: str = "walk"
-    wear: tuple[str, ...] = ("top", "bottom")
-    method: str = "network"
+    wear: tuple[str, ...] = ("shirt", "trousers")
+    method: str = "guided"
     inference: Inference = dataclasses.field(default_factory=Inference)
     compare: bool = False
     live: bool = False
@@ -112,19 +113,16 @@ class Shown:
         body = animated_meshes(load_body(), self.clip, _shape(self.choice), (), positions)
         return (*body, *self.garments)
 
-    def maps(self, frame: int, templates: tuple[str, ...]) -> dict[str, np.ndarray]:
-        """The network's maps of a frame, as pictures."""
+    def maps(self, frame: int) -> dict[str, np.ndarray]:
+        """The network's maps of a frame for what is worn, as pictures."""
         choice = self.choice
         weights = str(choice.inference.weights)
-        predictor = _predictor(weights, choice.shape, str(read_card(weights)["sha256"]))
-        window = predictor.config.inputs.at_rate(self.clip.fps).window
-        rows = np.maximum(np.arange(frame + 1 - window, frame + 1), 0)
+        worn = with_default_fabric(choice.wear, choice.fabric) or ("bottom",)
+        dresser = _network(worn, weights, choice.shape, str(read_card(weights)["sha256"]))
+        rows = np.arange(frame - dresser.history_length(self.clip.fps), frame + 1)
+        rows = np.maximum(rows, 0)
         return frame_maps(
-            predictor,
-            jnp.asarray(self.world[rows]),
-            jnp.asarray(self.shift[rows]),
-            self.clip.fps,
-            templates,
+            dresser, jnp.asarray(self.world[rows]), jnp.asarray(self.shift[rows]), self.clip.fps
         )
 
 
@@ -196,7 +194,7 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     if choice.live and choice.wear and choice.method in ("network", "guided"):
         live = Live(
             clip,
-            _worn(choice),
+            with_default_fabric(choice.wear, choice.fabric),
             method=choice.method,
             inference=choice.inference,
             simulation=_effects(choice),
@@ -222,7 +220,7 @@ def _dressed(
     """Garments by network or skinning, and lines that describe the result."""
     dressed = dress(
         clip,
-        _worn(choice),
+        with_default_fabric(choice.wear, choice.fabric),
         method=choice.method,  # pyright: ignore[reportArgumentType]
         inference=choice.inference,
         simulation=_effects(choice),
@@ -241,13 +239,6 @@ def _dressed(
     # Escaped, because a note may contain a file name and the page renders HTML.
     lines += [html.escape(note) for note in dressed.notes]
     return dressed.garments, lines
-
-
-def _worn(choice: Choice) -> tuple[str, ...]:
-    """What is worn, of the chosen fabric if that matters."""
-    if choice.method != "guided":
-        return choice.wear
-    return with_default_fabric(choice.wear, choice.fabric)
 
 
 def _effects(choice: Choice) -> Simulation:
@@ -306,10 +297,11 @@ def _shape(choice: Choice) -> Any | None:
 
 
 @functools.lru_cache(4)
-def _predictor(weights: str, shape: tuple[tuple[str, float], ...], sha256: str) -> Predictor:
-    """Loads a predictor; the checksum invalidates the cache when the weights change."""
+def _network(
+    wear: tuple[str, ...], weights: str, shape: tuple[tuple[str, float], ...], sha256: str
+) -> Dresser:
+    """Binds garments to a network; the checksum invalidates the cache when the weights change."""
     del sha256
-    body = load_body()
-    params = body.shape(**dict(shape)) if shape else None
-    rest = body.rest_vertices(body.default_shape() if params is None else params)
-    return with_body(load_predictor(weights), body, rest)
+    bare = Inference(weights=weights, strain_iterations=0, collisions=False)
+    params = load_body().shape(**dict(shape)) if shape else None
+    return make_dresser(wear, inference=bare, shape=params)

@@ -1,14 +1,15 @@
 """The network's maps as pictures."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from ..models import Predictor, clip_features
+from ..dressing import Dresser
+from ..models import BoundGarment, Modulation, Predictor, clip_features
 
 
 def texel_picture(
@@ -32,26 +33,32 @@ def texel_picture(
 
 
 def frame_maps(
-    predictor: Predictor,
+    dresser: Dresser,
     world: Float[Array, "window joints 3 3"],
     shift: Float[Array, "window joints 3"],
     fps: float,
-    templates: Sequence[str],
 ) -> dict[str, UInt8[np.ndarray, "height width 3"]]:
     """The network's inputs and outputs for a frame, as pictures.
 
     Args:
-        predictor: The network.
+        dresser: The network and what it dresses.
         world: World rotations of joints, the window's last frame being the one shown.
         shift: World translations of joints [m].
         fps: Frames per second.
-        templates: Garments whose maps are drawn.
 
     Returns:
-        Pictures by name: velocity, acceleration, then an offset map for each template.
+        Pictures by name: velocity, acceleration, then an offset map for each template; of several
+        garments of one template that of the first.
     """
+    predictor = dresser.predictor
+    assert predictor is not None, "skinning has no maps"
+    worn: dict[str, Modulation | None] = {}
+    for garment in dresser.worn:
+        assert isinstance(garment, BoundGarment)
+        worn.setdefault(garment.template, garment.modulation)
+    known = {t: m for t, m in worn.items() if m is not None}
     inputs = predictor.config.inputs
-    features, offset_maps = _maps(predictor, world, shift, fps, tuple(dict.fromkeys(templates)))
+    features, offset_maps = _maps(predictor, world, shift, known or None, fps, tuple(worn))
     atlas, motion_atlas = predictor.atlas, predictor.motion_atlas
     out, start = {}, 0
     for kind in inputs.kinds:
@@ -70,13 +77,19 @@ def frame_maps(
 
 @functools.partial(jax.jit, static_argnames=("fps", "templates"))
 def _maps(
-    predictor: Predictor, world: Array, shift: Array, fps: float, templates: tuple[str, ...]
+    predictor: Predictor,
+    world: Array,
+    shift: Array,
+    modulation: Mapping[str, Modulation] | None,
+    fps: float,
+    templates: tuple[str, ...],
 ) -> Any:
     texel_points = predictor.texel_points
     features = clip_features(
         texel_points.rest, texel_points.weights, world, shift, fps, predictor.config.inputs
     )[0]
-    return features, jax.tree.map(lambda x: x[0], predictor(world, shift, fps, templates))
+    found = predictor(world, shift, fps, templates, modulation)
+    return features, jax.tree.map(lambda x: x[0], found)
 
 
 def magnified(

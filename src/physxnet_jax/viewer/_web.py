@@ -399,8 +399,7 @@ class Viewer:
                 self._draw_maps(self.shown, frame)
 
     def _draw_maps(self, shown: Shown, frame: int) -> None:
-        worn = tuple(t for t in TEMPLATES if t in shown.choice.wear)
-        pictures = shown.maps(frame, worn or TEMPLATES)
+        pictures = shown.maps(frame)
         for name in self._pictures.keys() - pictures.keys():
             self._pictures.pop(name).remove()
         for name, picture in pictures.items():

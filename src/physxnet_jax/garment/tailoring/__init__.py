@@ -7,5 +7,11 @@ from ._cut import (
     measure_usual_arm as measure_usual_arm,
     resolve_measures as resolve_measures,
 )
-from ._measures import KINDS as KINDS, MEASURES as MEASURES, Kind as Kind, Range as Range
+from ._measures import (
+    DEFAULT_KINDS as DEFAULT_KINDS,
+    KINDS as KINDS,
+    MEASURES as MEASURES,
+    Kind as Kind,
+    Range as Range,
+)
 from ._tailor import tailor as tailor

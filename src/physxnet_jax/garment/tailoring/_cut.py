@@ -320,7 +320,11 @@ def cut_vertices(
     body = load_body() if body is None else body
     shape = body.default_shape() if shape is None else shape
     chosen = resolve_measures(kind, measures)
-    fixed = chosen if like is None else resolve_measures(kind, like)
+    fixed = chosen
+    if like is not None:
+        # Constants that are made under `jit` would be traced.
+        with jax.ensure_compile_time_eval():
+            fixed = resolve_measures(kind, like)
     style = kind_of(kind)
     pattern = pattern_of(kind, class_of(style, fixed))
     return cut(kind, pattern, chosen, body.rest_vertices(shape))[0]

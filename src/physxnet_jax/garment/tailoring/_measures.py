@@ -186,6 +186,9 @@ KINDS: dict[str, Kind] = {
     ),
 }
 
+DEFAULT_KINDS = {"top": "shirt", "bottom": "trousers", "dress": "aline"}
+"""The garment that stands for each template where one of it is measured."""
+
 
 def kind_of(name: str) -> Kind:
     """A kind by name.

@@ -11,9 +11,9 @@ from jaxtyping import Array, Float, Int
 
 from ...typing import pytree
 from .._assembly import Assembly
-from .._effect import Clock, Effect, Prepared, Step
+from .._effect import Clock, Effect, Prepared, Rest, Step
 from ._colored import column, corner_pairs
-from ._hinge import bending_hinges
+from ._hinge import bending_hinges, hinge_stencils
 
 # Largest amplitude that a step leaves of the roughest bending modes.
 _DAMPED = 0.1
@@ -63,6 +63,7 @@ class Bend(Effect):
             tuple(jnp.asarray(index[:, i]) for i in range(4)),
             tuple(column(h.coefficient[:, i]) for i in range(4)),
             column(1.0 / np.maximum(h.stiffness, 1e-12)),
+            column(h.stiffness * h.area),
         )
         load = _load(w, h.corners, h.coefficient, h.stiffness)
         # A power of two, so that body shapes share a compiled program.
@@ -172,6 +173,7 @@ class _Hinges:
     index: tuple[Int[Array, " members"], ...]
     coefficient: tuple[Float[Array, "members 1 1"], ...]
     compliance: Float[Array, "members 1 1"]
+    modulus: Float[Array, "members 1 1"]
 
 
 @pytree
@@ -180,7 +182,7 @@ class _Bend(Prepared):
     """Prepared bending.
 
     Attributes:
-        hinges: Corners, coefficients and compliances [m/N].
+        hinges: Corners, coefficients, compliances [m/N] and bending stiffness of the fabric [N m].
         weight: Inverse masses [1/kg].
         rows: Vertices coupled to each vertex.
         slots: Where each of `_PAIRS` of a hinge adds to ``values``.
@@ -201,10 +203,22 @@ class _Bend(Prepared):
         if "bend" not in factors:
             return self
         h, factor = self.hinges, factors["bend"]
-        softer = dataclasses.replace(h, compliance=h.compliance / factor)
+        softer = dataclasses.replace(
+            h, compliance=h.compliance / factor, modulus=h.modulus * factor
+        )
         known = factor if isinstance(factor, (int, float)) else _ROOM
         typical = 2.0 ** math.ceil(math.log2(self.typical * known))
         return dataclasses.replace(self, hinges=softer, typical=typical)
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        h = self.hinges
+        coefficient, area = hinge_stencils(*(rest.cloth[i] for i in h.index), xp=jnp)
+        hinges = dataclasses.replace(
+            h,
+            coefficient=tuple(c[:, None, None] for c in coefficient),
+            compliance=1.0 / jnp.maximum(h.modulus / area[:, None, None], 1e-12),
+        )
+        return dataclasses.replace(self, hinges=hinges, weight=rest.inverse_mass, values=None)
 
     def at_step(self, h: float) -> Prepared:
         """Assembles W K, with hinges softened where it would be unstable."""

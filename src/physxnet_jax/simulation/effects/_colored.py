@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 from ...geometry import greedy_coloring
 from ...typing import pytree
 from .._assembly import float32
-from .._effect import Clock, Prepared, Step
+from .._effect import Clock, Prepared, Rest, Step
 
 # Cost of one more loop, including its compilation, as a share of all elements.
 _LOOP = 0.12
@@ -188,6 +188,11 @@ class Group:
     weight: tuple[Float[Array, "members 1 1"], ...]
     law: Any
     color_groups: tuple[ColorGroup, ...]
+
+    def reshaped(self, rest: Rest, law: Any) -> "Group":
+        """The elements with the masses of another rest state, and another law."""
+        weight = tuple(rest.inverse_mass[i][:, None, None] for i in self.index)
+        return dataclasses.replace(self, weight=weight, law=law)
 
 
 def column(x: Float[np.ndarray, " members"]) -> Float[Array, "members 1 1"]:

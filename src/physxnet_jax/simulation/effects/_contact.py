@@ -20,7 +20,7 @@ from ...geometry import (
 )
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints, Step
+from .._effect import Clock, Effect, PosedPoints, Prepared, Rest, SkinnedPoints, Step
 from ._pinch import ROOM, Pinch, prepare_pinch
 from ._relief import relief
 from ._samples import Samples, sample_faces, with_samples
@@ -130,6 +130,7 @@ class BodyContact(Effect):
             float32(assembly.thickness[:, None]),
             float32(assembly.friction[:, None]),
             float32(free[:, None]),
+            jnp.asarray(used.astype(np.int32)),
             prepare_pinch(skin[used], np.asarray(skinned_points.normals), weights[used], body),
             jnp.asarray(assembly.loose[:, None]),
             self.push,
@@ -245,6 +246,7 @@ class _Contact(Prepared):
     thickness: Float[Array, "vertices 1"]
     friction: Float[Array, "vertices 1"]
     free: Float[Array, "vertices 1"]
+    used: Int[Array, " skin"]
     pinch: Pinch
     hanging: Bool[Array, "vertices 1"]
     push: float = dataclasses.field(metadata={"static": True})
@@ -261,6 +263,15 @@ class _Contact(Prepared):
         if "friction" not in factors:
             return self
         return dataclasses.replace(self, friction=self.friction * factors["friction"])
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        """The skin moves; which parts of it are compared, and its relief, stay."""
+        skin = dataclasses.replace(
+            self.skin,
+            rest=rest.body[self.used],
+            normals=rest.normals[self.used],
+        )
+        return dataclasses.replace(self, skin=skin)
 
     def init_state(self, batch: int) -> tuple[Array, Array]:
         room = jnp.full((self.skin.rest.shape[0], batch), ROOM, self.skin.rest.dtype)

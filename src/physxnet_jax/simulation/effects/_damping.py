@@ -8,7 +8,7 @@ from jaxtyping import Array
 from ...errors import check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
-from .._effect import Effect, Prepared
+from .._effect import Effect, Prepared, Rest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +35,9 @@ class Damping(Effect):
 @dataclasses.dataclass(frozen=True)
 class _Damping(Prepared):
     rate: float = dataclasses.field(metadata={"static": True})
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        return self
 
     def accelerate(self, velocity: Array, context: None, h: float) -> Array:
         return velocity * math.exp(-self.rate * h)

@@ -9,8 +9,8 @@ from jaxtyping import Array
 
 from ...errors import check_numbers
 from ...typing import pytree
-from .._assembly import Assembly
-from .._effect import Effect, Prepared
+from .._assembly import Assembly, norm
+from .._effect import Effect, Prepared, Rest
 from ._colored import Colored, Constraint, Group, color_constraints, directed
 
 
@@ -43,13 +43,22 @@ class Elastic(Effect):
         length = np.linalg.norm(x[edges[:, 0]] - x[edges[:, 1]], axis=1)
         length = np.maximum(length * max(1.0 - self.gathered, 0.05), 1e-4)
         law = {"length": length, "compliance": length / self.tension}
-        return _Elastic(color_constraints(edges, np.asarray(inverse_mass), law))
+        group = color_constraints(edges, np.asarray(inverse_mass), law)
+        return _Elastic(group, max(1.0 - self.gathered, 0.05), self.tension)
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Elastic(Colored):
     group: Group
+    shorter: float = dataclasses.field(metadata={"static": True})
+    tension: float = dataclasses.field(metadata={"static": True})
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        a, b = (rest.cloth[i] for i in self.group.index)
+        length = jnp.maximum(norm(b - a) * self.shorter, 1e-4)[:, None, None]
+        law = {"length": length, "compliance": length / self.tension}
+        return dataclasses.replace(self, group=self.group.reshaped(rest, law))
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
         def excess(x: tuple[Array, ...]) -> Constraint:

@@ -7,7 +7,7 @@ from jaxtyping import Array
 
 from ...typing import pytree
 from .._assembly import Assembly
-from .._effect import Effect, Prepared
+from .._effect import Effect, Prepared, Rest
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +33,9 @@ class Gravity(Effect):
 @dataclasses.dataclass(frozen=True)
 class _Gravity(Prepared):
     g: float = dataclasses.field(metadata={"static": True})
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        return self
 
     def accelerate(self, velocity: Array, context: None, h: float) -> Array:
         return velocity.at[:, 1].add(-self.g * h)

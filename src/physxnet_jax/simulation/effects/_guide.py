@@ -13,7 +13,7 @@ from ...errors import check_numbers
 from ...geometry import pad_rows, patch_shares
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Clock, Effect, Prepared, Step
+from .._effect import Clock, Effect, Prepared, Rest, Step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,6 +96,10 @@ class PreparedGuide(Prepared):
     def means(self, values: Float[Array, "vertices n batch"]) -> Float[Array, "patches n batch"]:
         """Means of vertices over the patches."""
         return jnp.einsum("pk,pkcb->pcb", self.weight, values[self.index])
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        # Patches are of vertices, and weigh them as they were.
+        return self
 
     def receive(
         self, state: GuideState, guide: tuple[Array, Array], begins: Array, length: float

@@ -1,6 +1,7 @@
 """Hinges: bending stencils over two triangles that share an edge."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -51,31 +52,33 @@ def bending_hinges(assembly: Assembly) -> Hinges:
     """
     x = assembly.rest
     interior = hinges(assembly.faces[sound(x, assembly.faces)])
-    coefficient, area = hinge_stencils(x, interior)
+    coefficient, area = hinge_stencils(*(x[interior[:, i]] for i in range(4)), xp=np)
     length = np.linalg.norm(x[interior[:, 1]] - x[interior[:, 0]], axis=1)
     vertex_bend = np.zeros(len(x))
     vertex_bend[assembly.faces] = assembly.bend[:, None]
     k = vertex_bend[interior[:, 0]] / area
-    return Hinges(interior, coefficient, area, length, k)
+    return Hinges(interior, np.column_stack(coefficient), area, length, k)
 
 
-def hinge_stencils(
-    x: Float[np.ndarray, "vertices 3"], quads: Int[np.ndarray, "hinges 4"]
-) -> tuple[Float[np.ndarray, "hinges 4"], Float[np.ndarray, " hinges"]]:
-    """Coefficients of (a, b, left, right) and the total area of both triangles."""
-    a, b, p, q = (x[quads[:, i]] for i in range(4))
+def hinge_stencils(a: Any, b: Any, p: Any, q: Any, xp: Any) -> tuple[list[Any], Any]:
+    """Coefficients of (a, b, left, right) and the total area of both triangles.
 
-    def cot(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        sine = np.linalg.norm(np.cross(u, v), axis=1)
-        return np.einsum("ij,ij->i", u, v) / np.maximum(sine, 1e-9)
+    Args:
+        a: First ends of the edges, shape [hinges, 3].
+        b: Second ends.
+        p: Opposite corners on the left.
+        q: Opposite corners on the right.
+        xp: numpy or jax.numpy.
+    """
+
+    def sine(u: Any, v: Any) -> Any:
+        normal = xp.cross(u, v)
+        return xp.sqrt(xp.maximum(xp.sum(normal * normal, axis=1), 1e-18))
+
+    def cot(u: Any, v: Any) -> Any:
+        return xp.sum(u * v, axis=1) / sine(u, v)
 
     at_a = cot(b - a, p - a), cot(b - a, q - a)
     at_b = cot(a - b, p - b), cot(a - b, q - b)
-    c = np.column_stack(
-        [at_b[0] + at_b[1], at_a[0] + at_a[1], -at_a[0] - at_b[0], -at_a[1] - at_b[1]]
-    )
-    area = 0.5 * (
-        np.linalg.norm(np.cross(b - a, p - a), axis=1)
-        + np.linalg.norm(np.cross(b - a, q - a), axis=1)
-    )
-    return c, area
+    c = [at_b[0] + at_b[1], at_a[0] + at_a[1], -at_a[0] - at_b[0], -at_a[1] - at_b[1]]
+    return c, 0.5 * (sine(b - a, p - a) + sine(b - a, q - a))

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int
 from ...errors import check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
-from .._effect import Effect, Prepared
+from .._effect import Effect, Prepared, Rest
 from .._quantile import upper_quantile
 from ._colored import Colored, Constraint, Group, color_constraints, directed
 from ._hinge import sound
@@ -52,6 +52,7 @@ class Membrane(Effect):
             "warp": 1.0 / np.maximum(a * fabric[:, 0], 1e-9),
             "weft": 1.0 / np.maximum(a * fabric[:, 1], 1e-9),
             "shear": 1.0 / np.maximum(a * fabric[:, 2], 1e-9),
+            "area": a,
         }
         group = color_constraints(faces[usable], np.asarray(inverse_mass), law)
         return _Membrane(group, 1.0 / self.compression)
@@ -66,27 +67,28 @@ def rest_frames(
     level triangles.
     """
     x, f = assembly.rest, assembly.faces
-    e1, e2 = x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]]
-    normal = np.cross(e1, e2)
-    twice = np.linalg.norm(normal, axis=1)
-    n = normal / np.maximum(twice, 1e-12)[:, None]
-    warp = -n * n[:, 1:2]
-    warp[:, 1] += 1.0
-    level = np.linalg.norm(warp, axis=1) < 0.2
-    depth = -n * n[:, 2:3]
-    depth[:, 2] += 1.0
-    warp[level] = depth[level]
-    warp /= np.maximum(np.linalg.norm(warp, axis=1), 1e-12)[:, None]
-    weft = np.cross(n, warp)
-    edges = np.stack(
-        [
-            np.stack([np.sum(e1 * warp, axis=1), np.sum(e2 * warp, axis=1)], axis=1),
-            np.stack([np.sum(e1 * weft, axis=1), np.sum(e2 * weft, axis=1)], axis=1),
-        ],
-        axis=1,
-    )
-    safe = np.where((twice > 1e-10)[:, None, None], edges, np.eye(2))
-    return f, 0.5 * twice, np.linalg.inv(safe)
+    return f, *_frames(x[f[:, 0]], x[f[:, 1]], x[f[:, 2]], xp=np)
+
+
+def _frames(a: Any, b: Any, c: Any, xp: Any) -> tuple[Any, Any]:
+    """Areas and inverse edge matrices of triangles, by numpy or jax.numpy."""
+
+    def length(v: Any) -> Any:
+        return xp.sqrt(xp.maximum(xp.sum(v * v, axis=1), 1e-24))
+
+    e1, e2 = b - a, c - a
+    normal = xp.cross(e1, e2)
+    twice = length(normal)
+    n = normal / twice[:, None]
+    up, ahead = (xp.asarray(np.eye(3)[k : k + 1], a.dtype) for k in (1, 2))
+    warp = up - n * n[:, 1:2]
+    warp = xp.where((length(warp) < 0.2)[:, None], ahead - n * n[:, 2:3], warp)
+    warp = warp / length(warp)[:, None]
+    weft = xp.cross(n, warp)
+    one, two = ([xp.sum(e * way, axis=1) for e in (e1, e2)] for way in (warp, weft))
+    edges = xp.stack([xp.stack(one, axis=1), xp.stack(two, axis=1)], axis=1)
+    safe = xp.where((twice > 1e-10)[:, None, None], edges, xp.asarray(np.eye(2)[None], a.dtype))
+    return 0.5 * twice, xp.linalg.inv(safe)
 
 
 @pytree
@@ -102,6 +104,18 @@ class _Membrane(Colored):
         law = dict(self.group.law)
         law |= {k: law[k] / factors["stretch"] for k in ("warp", "weft", "shear")}
         return dataclasses.replace(self, group=dataclasses.replace(self.group, law=law))
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        law = self.group.law
+        area, inverse = _frames(*(rest.cloth[i] for i in self.group.index), xp=jnp)
+        area = area[:, None, None]
+        entries = {"u1": (0, 0), "u2": (1, 0), "v1": (0, 1), "v2": (1, 1)}
+        law = {
+            **{k: inverse[:, i, j, None, None] for k, (i, j) in entries.items()},
+            **{k: law[k] * (law["area"] / area) for k in ("warp", "weft", "shear")},
+            "area": area,
+        }
+        return dataclasses.replace(self, group=self.group.reshaped(rest, law))
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
         def direction(one: str, two: str, compliance: str) -> Any:

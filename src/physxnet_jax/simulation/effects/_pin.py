@@ -9,7 +9,7 @@ from jaxtyping import Array, Int
 
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints, Step
+from .._effect import Clock, Effect, PosedPoints, Prepared, Rest, SkinnedPoints, Step
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,6 +37,10 @@ class _Pin(Prepared):
     @property
     def skinned_points(self) -> SkinnedPoints:
         return self.skin
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        skin = dataclasses.replace(self.skin, rest=rest.cloth[self.index])
+        return dataclasses.replace(self, skin=skin)
 
     def begin(
         self, base: Array, start: PosedPoints, end: PosedPoints, clock: Clock, state: Any

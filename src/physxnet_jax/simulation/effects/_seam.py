@@ -10,7 +10,7 @@ from jaxtyping import Array
 from ...errors import SimulationError, check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
-from .._effect import Effect, Prepared
+from .._effect import Effect, Prepared, Rest
 from ._colored import Colored, Constraint, Group, color_constraints
 
 
@@ -49,6 +49,9 @@ class Seam(Effect):
 @dataclasses.dataclass(frozen=True)
 class _Seam(Colored):
     group: Group
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        return dataclasses.replace(self, group=self.group.reshaped(rest, self.group.law))
 
     def measure(self, law: Any, corners: tuple[Array, ...]) -> list[Any]:
         def opening(x: tuple[Array, ...]) -> Constraint:

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int
 from ...errors import check_numbers
 from ...geometry import mesh_edges
 from ...typing import pytree
-from .._assembly import Assembly
-from .._effect import Clock, Effect, Prepared, Step
+from .._assembly import Assembly, float32, norm
+from .._effect import Clock, Effect, Prepared, Rest, Step
 from .._quantile import upper_quantile
 from ._colored import ColorGroup, bundled, color_groups, column, directed, sweep
 
@@ -49,6 +49,7 @@ class Stretch(Effect):
         )
         load = np.zeros(len(length))
         np.add.at(load, edges.of_face, (assembly.stretch * area)[:, None])
+        opposite, modulus = _triangles(f, edges.of_face, assembly.stretch, len(length))
         # The bound gives edges of zero length the stiffest spring.
         stiffness = load / np.maximum(length, 1e-4) ** 2
         compliance = 1.0 / np.maximum(stiffness, 1e-6)
@@ -60,17 +61,51 @@ class Stretch(Effect):
             (column(w[a]), column(w[b])),
             column(length[order]),
             column(compliance[order]),
+            jnp.asarray(opposite[:, order]),
+            float32(modulus[:, order]),
         )
         return _Stretch(springs, parts, 1.0 / self.compression)
+
+
+def _triangles(
+    faces: Int[np.ndarray, "faces 3"],
+    of_face: Int[np.ndarray, "faces 3"],
+    stretch: Float[np.ndarray, " faces"],
+    count: int,
+) -> tuple[Int[np.ndarray, "k edges"], Float[np.ndarray, "k edges"]]:
+    """Corners opposite to edges in their triangles, and the moduli of these; 0 for padding."""
+    edge = of_face.ravel()
+    # Edge k of a face is opposite to its corner k.
+    corner = faces.ravel()
+    order = np.argsort(edge, kind="stable")
+    edge, corner, modulus = edge[order], corner[order], np.repeat(stretch, 3)[order]
+    place = np.arange(len(edge)) - np.searchsorted(edge, edge)
+    shape = (int(place.max(initial=0)) + 1, count)
+    opposite, moduli = np.zeros(shape, np.int32), np.zeros(shape)
+    opposite[place, edge], moduli[place, edge] = corner, modulus
+    return opposite, moduli
 
 
 @pytree
 @dataclasses.dataclass(frozen=True)
 class _Springs:
+    """Edges in the order of their colours.
+
+    Attributes:
+        ends: Vertices of each edge.
+        weight: Their inverse masses [1/kg].
+        length: Rest lengths [m].
+        compliance: Inverse stiffnesses [m/N].
+        opposite: Third corners of the triangles at each edge.
+        modulus: Stiffness of their fabric [N/m], 0 for padding.
+    """
+
     ends: tuple[Int[Array, " members"], Int[Array, " members"]]
     weight: tuple[Float[Array, "members 1 1"], Float[Array, "members 1 1"]]
     length: Float[Array, "members 1 1"]
     compliance: Float[Array, "members 1 1"]
+    opposite: Int[Array, "k members"]
+    modulus: Float[Array, "k members"]
 
 
 @pytree
@@ -87,8 +122,28 @@ class _Stretch(Prepared):
         if "stretch" not in factors:
             return self
         s = self.springs
-        softer = dataclasses.replace(s, compliance=s.compliance / factors["stretch"])
+        softer = dataclasses.replace(
+            s,
+            compliance=s.compliance / factors["stretch"],
+            modulus=s.modulus * factors["stretch"],
+        )
         return dataclasses.replace(self, springs=softer)
+
+    def reshaped(self, rest: Rest) -> Prepared:
+        s = self.springs
+        a, b = (rest.cloth[i] for i in s.ends)
+        across = rest.cloth[s.opposite] - a[None]
+        area = 0.5 * norm(jnp.cross((b - a)[None], across))
+        length = norm(b - a)
+        load = jnp.sum(s.modulus * area, axis=0)
+        compliance = 1.0 / jnp.maximum(load / jnp.maximum(length, 1e-4) ** 2, 1e-6)
+        springs = dataclasses.replace(
+            s,
+            weight=tuple(rest.inverse_mass[i][:, None, None] for i in s.ends),
+            length=length[:, None, None],
+            compliance=compliance[:, None, None],
+        )
+        return dataclasses.replace(self, springs=springs)
 
     def begin(self, base: Array, start: None, end: None, clock: Clock, state: Any) -> tuple:
         s = self.springs

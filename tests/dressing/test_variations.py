@@ -1,0 +1,140 @@
+"""Other shapes, cuts and fabrics of the same dresser, and gradients by them."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from physxnet_jax.dressing import (
+    Inference,
+    Simulation,
+    clothe,
+    make_dresser,
+    with_cut,
+    with_fabric,
+    with_shape,
+)
+from physxnet_jax.errors import PhysXNetError, SimulationError
+from physxnet_jax.garment import cut_vertices, tailor
+from physxnet_jax.motion import load_motion
+
+NANO = Inference(weights="nano")
+
+
+@pytest.fixture(scope="module")
+def motion():
+    walk = load_motion("walk", fps=30.0)
+    return walk.rotations[10:13], walk.root[10:13]
+
+
+@pytest.fixture(scope="module")
+def guided():
+    return make_dresser(
+        ["shorts"], method="guided", inference=NANO, simulation=Simulation(substeps=4)
+    )
+
+
+def test_a_cut_replaces_the_rest_shape_of_its_garment():
+    dresser = make_dresser(["shorts", "tee"], inference=NANO)
+    wide = cut_vertices("shorts", {"ease": 0.2})
+    new = with_cut(dresser, {"shorts": wide})
+    known = {w.name: w for w in new.worn}
+    np.testing.assert_array_equal(known["shorts"].rest, wide)
+    np.testing.assert_array_equal(known["tee"].rest, dresser.worn[1].rest)
+    lengths = [float(d.strain.constraints[0].length[0].sum()) for d in (new, dresser)]
+    assert lengths[0] > lengths[1]
+    with pytest.raises(PhysXNetError, match=r"No garment 'skirt' is worn, only"):
+        with_cut(dresser, {"skirt": wide})
+    with pytest.raises(PhysXNetError, match="vertices for a mesh of"):
+        with_cut(dresser, {"tee": wide})
+
+
+def test_only_simulated_cloth_has_a_fabric(guided):
+    with pytest.raises(PhysXNetError, match="guided"):
+        with_fabric(make_dresser(["shorts"], inference=NANO), bend=2.0)
+    with pytest.raises(SimulationError, match="Unknown parameter weight"):
+        with_fabric(guided, weight=2.0)
+    softer = with_fabric(guided, stretch=0.5).guided.system.effects
+    for one, two in zip(softer, guided.guided.system.effects, strict=True):
+        if "stretch" in one.materials:
+            np.testing.assert_allclose(
+                one.springs.compliance, 2.0 * two.springs.compliance, rtol=1e-6
+            )
+
+
+@pytest.mark.release
+def test_guided_cloth_of_another_shape_is_near_that_of_a_new_dresser(guided, motion):
+    """And far from that of the shape before."""
+    shape = guided.body.shape(weight_up=0.6, height_up=0.5)
+    # Not cut for that person: the same garment, moved to the shape.
+    anew = make_dresser(
+        [tailor("shorts")],
+        method="guided",
+        inference=NANO,
+        simulation=Simulation(substeps=4),
+        shape=shape,
+    )
+    cloth = jax.jit(lambda d: clothe(d, *motion, 30.0)["shorts"][-1])
+    found, wanted, before = (cloth(d) for d in (with_shape(guided, shape), anew, guided))
+    off, moved = (float(jnp.abs(x - wanted).mean()) for x in (found, before))
+    assert off < 0.2 * moved and moved > 3e-3
+
+
+@pytest.mark.release
+def test_gradients_by_pose_shape_cut_and_fabric_match_differences(guided, motion):
+    """In float64, within a thousandth: the whole way from a pose to the simulated cloth."""
+    # What the tailor cuts is float32: its slope is taken once.
+    cut, slope = jax.jvp(
+        lambda ease: cut_vertices("shorts", {"ease": ease}, like={}),
+        (jnp.float32(0.1),),
+        (jnp.float32(1.0),),
+    )
+    with jax.enable_x64(True):
+
+        def wide(tree):
+            return jax.tree.map(
+                lambda x: x.astype("float64") if jnp.issubdtype(x.dtype, jnp.floating) else x, tree
+            )
+
+        person = wide(guided)
+        solver = dataclasses.replace(person.guided.solver, precision="float64")
+        person = dataclasses.replace(
+            person, guided=dataclasses.replace(person.guided, solver=solver)
+        )
+        q, p = wide(motion)
+        rng = np.random.default_rng(0)
+        way = jnp.asarray(rng.normal(0.0, 0.05, person.body.default_shape().shape))
+        weight = jnp.asarray(rng.normal(size=person.worn[0].rest.shape))
+        hip = person.body.joint("LeftUpLeg")
+
+        @jax.jit
+        def loss(a):
+            turned = q.at[:, hip, 1].add(a[0])
+            turned = turned / jnp.linalg.norm(turned, axis=-1, keepdims=True)
+            other = with_shape(person, wide(person.body.default_shape()) + a[1] * way)
+            pattern = other.worn[0].rest + wide(cut - guided.worn[0].rest) + a[2] * wide(slope)
+            other = with_cut(other, {"shorts": pattern})
+            other = with_fabric(other, stretch=1.0 + a[3], bend=1.0 + a[4])
+            return jnp.sum(clothe(other, turned, p, 30.0)["shorts"][-1] * weight)
+
+        found = np.asarray(jax.jit(jax.grad(loss))(jnp.zeros(5)))
+        for k, step in enumerate((1e-6, 1e-5, 1e-6, 1e-4, 1e-4)):
+            ahead, back = (float(loss(jnp.zeros(5).at[k].set(s))) for s in (step, -step))
+            assert found[k] == pytest.approx((ahead - back) / (2 * step), rel=1e-3), k
+            assert found[k] != 0.0
+
+
+@pytest.mark.release
+def test_ease_widens_guided_cloth(guided, motion):
+    """The tailor's measure reaches the simulated cloth, with its sign."""
+
+    def girth(ease):
+        cloth = with_cut(guided, {"shorts": cut_vertices("shorts", {"ease": ease}, like={})})
+        x = clothe(cloth, *motion, 30.0)["shorts"][-1]
+        hem = jnp.asarray(guided.garments[0].loops["hem"])
+        return jnp.sum(jnp.linalg.norm(x[hem] - jnp.roll(x[hem], 1, axis=0), axis=1))
+
+    value, slope = jax.jit(lambda e: jax.jvp(girth, (e,), (jnp.ones_like(e),)))(jnp.float32(0.1))
+    assert np.isfinite(float(value)) and float(slope) > 0.1
