@@ -17,7 +17,7 @@ from physxnet_jax.models import clip_features
 from physxnet_jax.motion import clip_transforms, load_motion
 from physxnet_jax.viewer import magnified, render_frame, render_preview, texel_picture
 
-FRAME = 44
+FRAME = 31
 SIZE = 288
 
 
