@@ -2,7 +2,7 @@
 
 Command: python experiments/bench_peers.py
          --torch PYTHON (one that has torch and numpy; default: $PHYSXNET_TORCH),
-         --weights paper, --batches 1 32, --rounds 3,
+         --weights small, --batches 1 32, --rounds 3,
          --out experiments/results/peers.json
 Cost:    about two minutes on two cores, most of it PyTorch's compilation.
 Result:  peers.json and .md: milliseconds a frame of the network from motion maps to offset
@@ -84,7 +84,7 @@ def ours(predictor: Predictor, maps: np.ndarray, seconds: float) -> tuple[dict, 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--torch", default=os.environ.get("PHYSXNET_TORCH"))
-    parser.add_argument("--weights", default="paper")
+    parser.add_argument("--weights", default="small")
     parser.add_argument("--batches", type=int, nargs="+", default=[1, 32])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=3.0)

@@ -49,8 +49,8 @@ def main() -> None:
     ]
     pictures = []
     for outfit in OUTFITS:
-        raw = dress(person, outfit, inference=Inference(collisions=False))
-        clip = dress(person, outfit)
+        raw = dress(person, outfit, method="network", inference=Inference(collisions=False))
+        clip = dress(person, outfit, method="network")
         for a, b in zip(raw.garments, clip.garments, strict=True):
             moved = np.linalg.norm(a.positions - b.positions, axis=2).max()
             lines.append(

@@ -49,8 +49,8 @@ def main() -> None:
             began = time.perf_counter()
             person = load_character(files["mannequin"], motion=motion, frames=int(30 * SECONDS))
             spent = time.perf_counter() - began
-            raw = dress(person, outfit, inference=Inference(collisions=False))
-            clip = dress(person, outfit)
+            raw = dress(person, outfit, method="network", inference=Inference(collisions=False))
+            clip = dress(person, outfit, method="network")
             for g in clip.garments:
                 lines.append(
                     f"| {name} | {g.name} | {spent:.0f} | {1e3 * person.apart:.0f} |"

@@ -81,9 +81,9 @@ def main() -> None:
             began = time.perf_counter()
             person = make_character(mesh, 30.0, bind=bind)
             spent = time.perf_counter() - began
-            worn = dress(person, WEAR)
-            true = dress(motion, WEAR, shape=shape)
-            other = dress(motion, WEAR)
+            worn = dress(person, WEAR, method="network")
+            true = dress(motion, WEAR, method="network", shape=shape)
+            other = dress(motion, WEAR, method="network")
             found, control = errors(worn, true), errors(other, true)
             cells = " | ".join(f"{e:.1f}" for e in found)
             beside = " / ".join(f"{e:.0f}" for e in control)

@@ -169,60 +169,55 @@ def squared_table(rows: list[ActionError], methods: tuple[str, ...]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def clothes_table(rows: list[ActionError]) -> str:
-    """Means over the twelve actions: errors, and whether cloth looks like cloth."""
+# What `clothes_table` tells of each row besides errors: digits and value.
+LOOKS = {
+    "folds": (2, lambda r: r.fold_strength),
+    "spectrum": (2, lambda r: r.spectrum),
+    "tension": (2, lambda r: r.tension_p99 / r.tension_p99_reference),
+    "jerk": (2, lambda r: r.jitter / r.jitter_reference),
+    "visible skin, %": (3, lambda r: 100.0 * r.visible_skin),
+    "ms a frame and garment": (1, lambda r: r.ms_per_frame),
+}
+
+
+def clothes_table(
+    rows: list[ActionError],
+    names: dict[str, str] | None = None,
+    looks: tuple[str, ...] = tuple(LOOKS),
+) -> str:
+    """Means over the twelve actions: errors, and whether cloth looks like cloth.
+
+    Args:
+        rows: Rows of clothes.
+        names: Methods to show and what to call them; all under their own names if None.
+        looks: Names of `LOOKS` to show.
+    """
     lines = [
-        "| method | shirt, mm | trousers, mm | dress, mm | over skinning | better in | folds |"
-        " spectrum | tension | jerk | visible skin, % | ms a frame and garment |",
-        "|---" * 12 + "|",
+        "| method | shirt, mm | trousers, mm | dress, mm | over skinning | better in |"
+        f" {' | '.join(looks)} |",
+        "|---" * (6 + len(looks)) + "|",
     ]
     plain = {(r.action, r.template): r.rmse_vertices_mm for r in rows if r.method == "lbs"}
-    for method in dict.fromkeys(r.method for r in rows):
+    names = {r.method: r.method for r in rows} if names is None else names
+    for method, label in names.items():
         mine = [r for r in rows if r.method == method]
+        if not mine:
+            continue
         of = [[r.rmse_vertices_mm for r in mine if r.template == t] for t in TEMPLATES]
         base = [[plain[r.action, t] for r in mine if r.template == t] for t in TEMPLATES]
         ratios = [f"{sum(a) / sum(b):.2f}" for a, b in zip(of, base, strict=True) if a]
         wins = sum(r.rmse_vertices_mm < plain[r.action, r.template] for r in mine)
         cells = [f"{statistics.fmean(x):.1f}" if x else "" for x in of]
         cells += ["", ""] if method == "lbs" else [" ".join(ratios), f"{wins} of {len(mine)}"]
-        cells += [
-            f"{statistics.fmean(values):.{digits}f}"
-            for digits, values in (
-                (2, [r.fold_strength for r in mine]),
-                (2, [r.spectrum for r in mine]),
-                (2, [r.tension_p99 / r.tension_p99_reference for r in mine]),
-                (2, [r.jitter / r.jitter_reference for r in mine]),
-                (3, [100.0 * r.visible_skin for r in mine]),
-                (1, [r.ms_per_frame for r in mine]),
-            )
-        ]
-        lines.append(f"| {method} | {' | '.join(cells)} |")
+        for digits, value in (LOOKS[name] for name in looks):
+            cells.append(f"{statistics.fmean(map(value, mine)):.{digits}f}")
+        lines.append(f"| {label} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
 def short_table(rows: list[ActionError]) -> str:
-    """A few methods of `clothes_table`."""
-    lines = [
-        "| method | shirt, mm | trousers, mm | dress, mm | better than skinning | folds |"
-        " visible skin, % | ms a frame and garment |",
-        "|---" * 8 + "|",
-    ]
-    plain = {(r.action, r.template): r.rmse_vertices_mm for r in rows if r.method == "lbs"}
-    for method, words in SHORT.items():
-        mine = [r for r in rows if r.method == method]
-        if not mine:
-            continue
-        cells = []
-        for t in TEMPLATES:
-            here = [r.rmse_vertices_mm for r in mine if r.template == t]
-            cells.append(f"{statistics.fmean(here):.1f}" if here else "")
-        wins = sum(r.rmse_vertices_mm < plain[r.action, r.template] for r in mine)
-        cells.append("" if method == "lbs" else f"{wins} of {len(mine)}")
-        cells.append(f"{statistics.fmean(r.fold_strength for r in mine):.2f}")
-        cells.append(f"{100 * statistics.fmean(r.visible_skin for r in mine):.3f}")
-        cells.append(f"{statistics.fmean(r.ms_per_frame for r in mine):.1f}")
-        lines.append(f"| {words} | {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+    """A few methods and columns of `clothes_table`."""
+    return clothes_table(rows, SHORT, ("folds", "visible skin, %", "ms a frame and garment"))
 
 
 def stress_table() -> str:
