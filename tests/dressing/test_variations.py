@@ -18,15 +18,8 @@ from physxnet_jax.dressing import (
 )
 from physxnet_jax.errors import PhysXNetError, SimulationError
 from physxnet_jax.garment import cut_vertices, tailor
-from physxnet_jax.motion import load_motion
 
 NANO = Inference(weights="nano")
-
-
-@pytest.fixture(scope="module")
-def motion():
-    walk = load_motion("walk", fps=30.0)
-    return walk.rotations[10:13], walk.root[10:13]
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +69,9 @@ def test_guided_cloth_of_another_shape_is_near_that_of_a_new_dresser(guided, mot
         simulation=Simulation(substeps=4),
         shape=shape,
     )
-    cloth = jax.jit(lambda d: clothe(d, *motion, 30.0)["shorts"][-1])
+    # Three frames: later, folds go ways of their own.
+    q, p = (x[:3] for x in motion)
+    cloth = jax.jit(lambda d: clothe(d, q, p, 30.0)["shorts"][-1])
     found, wanted, before = (cloth(d) for d in (with_shape(guided, shape), anew, guided))
     off, moved = (float(jnp.abs(x - wanted).mean()) for x in (found, before))
     assert off < 0.2 * moved and moved > 3e-3
