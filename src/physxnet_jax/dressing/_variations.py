@@ -34,6 +34,7 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
             with the shape instead.
 
     Example:
+        >>> from physxnet_jax import make_dresser
         >>> person = make_dresser(["trousers"])
         >>> tall = with_shape(person, person.body.shape(height_up=0.5))
         >>> bool(tall.worn[0].rest[:, 1].max() > person.worn[0].rest[:, 1].max())
@@ -62,6 +63,8 @@ def with_cut(dresser: Dresser, cut: Mapping[str, Float[Array, "vertices 3"]]) ->
         PhysXNetError: No garment has such a name, or its mesh another number of vertices.
 
     Example:
+        >>> from physxnet_jax import make_dresser
+        >>> from physxnet_jax.garment import cut_vertices
         >>> person = make_dresser(["shorts"], method="lbs")
         >>> wide = cut_vertices("shorts", {"ease": 0.2})
         >>> bool((with_cut(person, {"shorts": wide}).worn[0].rest == wide).all())
