@@ -229,6 +229,7 @@ def test_exported_rest_body_and_garments_reload_in_place(tmp_path, body, rest):
     np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
+@pytest.mark.release
 def test_other_body_shapes_stand_on_the_floor(tmp_path):
     out = tmp_path / "a.npz"
     words = [

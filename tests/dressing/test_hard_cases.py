@@ -116,6 +116,7 @@ def test_static_pose_is_a_fixed_point(judge, motion):
         np.testing.assert_allclose(np.asarray(x), np.asarray(x[:1]).repeat(FRAMES, 0), atol=1e-6)
 
 
+@pytest.mark.release
 def test_constant_velocity_is_a_fixed_point_after_the_window_is_full(dresser, judge, motion):
     """Constant maps in, constant cloth out, seen from the person."""
     _, out, _, _ = judge(*gliding(*motion))

@@ -128,8 +128,8 @@ def test_ease_widens_guided_cloth(guided, motion):
     def girth(ease):
         cloth = with_cut(guided, {"shorts": cut_vertices("shorts", {"ease": ease}, like={})})
         x = clothe(cloth, *motion, 30.0)["shorts"][-1]
-        hem = jnp.asarray(guided.garments[0].loops["hem"])
-        return jnp.sum(jnp.linalg.norm(x[hem] - jnp.roll(x[hem], 1, axis=0), axis=1))
+        one, other = jnp.asarray(guided.garments[0].loops["hem"]).T
+        return jnp.sum(jnp.linalg.norm(x[one] - x[other], axis=1))
 
     value, slope = jax.jit(lambda e: jax.jvp(girth, (e,), (jnp.ones_like(e),)))(jnp.float32(0.1))
     assert np.isfinite(float(value)) and float(slope) > 0.1

@@ -112,7 +112,7 @@ def test_one_frame_clip_is_treated_as_static(dresser, motion):
     [
         "nano",
         pytest.param("small", marks=pytest.mark.nightly),
-        "base",
+        pytest.param("base", marks=pytest.mark.release),
         pytest.param("base+mirror", marks=pytest.mark.nightly),
         "paper",
     ],

@@ -375,6 +375,7 @@ def test_folded_batch_norm_keeps_the_predictions(worn):
         np.testing.assert_array_equal(np.asarray(one), np.asarray(two))
 
 
+@pytest.mark.release
 def test_bfloat16_and_float64_predictions_are_close_to_float32(worn):
     """bfloat16 has 8 bits: half a per cent a number, averaged over the taps of a kernel."""
     atlas, surface, _ = worn

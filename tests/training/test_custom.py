@@ -109,6 +109,7 @@ def test_custom_network_is_saved_and_loaded(trained, tmp_path):
     np.testing.assert_allclose(a, b, atol=2e-4)
 
 
+@pytest.mark.release
 def test_train_step_is_compiled_once_per_problem(walk):
     data = load_data(CONFIG, [walk])
     problem, state = make_problem(

@@ -21,6 +21,7 @@ from ..dressing import (
 )
 from ..errors import FormatError, PhysXNetError
 from ..io import check_output, write_clip
+from ..models import read_card
 from ..motion import Motion, load_motion
 from ..viewer import check_preview, render_preview
 from ._calibrate import choose
@@ -280,6 +281,9 @@ def _check_method(command: Dress) -> None:
     if command.budget_ms is not None and command.max_error_mm is not None:
         raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
     check_simulates(command.method, command.simulation, command.outfit, command.inference.weights)
+    if command.method in ("network", "guided"):
+        # Before motion and garments are loaded.
+        read_card(str(command.inference.weights))
     for flag in changed(command.inference):
         if command.method == "guided" and flag in ("--weights", "--tta"):
             continue

@@ -10,6 +10,7 @@ from ..body import Body
 from ..errors import PhysXNetError
 from ..garment import SkinnedGarment, skin_garment
 from ..simulation import (
+    Effect,
     PosedPoints,
     Solver,
     State,
@@ -20,7 +21,7 @@ from ..simulation import (
     skin_effects,
     start_state,
 )
-from ..simulation.effects import Guide, PreparedGuide
+from ..simulation.effects import BodyContact, Guide, LayerContact, PreparedGuide
 from ..typing import pytree
 from ._inference import Inference
 from ._simulate import Simulation, build_scene
@@ -141,7 +142,9 @@ def prepare_guided(
     solver = dataclasses.replace(simulation, substeps=substeps).solver
     given = [e for e in simulation.effects or () if isinstance(e, Guide)]
     guide = given or [Guide(spacing=_SPACING, time_constant=_TIME_CONSTANT * substeps)]
-    scene = build_scene(outfit.garments, outfit.body, shape, simulation, guide)
+    # Effects that are given are taken as they are.
+    contact = _contact(len(outfit.garments)) if simulation.effects is None else ()
+    scene = build_scene(outfit.garments, outfit.body, shape, simulation, (*guide, *contact))
     places = {id(g): k for k, g in enumerate(outfit.garments)}
     prepared = prepare_scene(scene)
     system = _softened(make_system(prepared, solver), _softness(substeps * _RATE))
@@ -173,6 +176,12 @@ def reshape_guided(
     if scene.colliders is None:
         return new
     return dataclasses.replace(new, colliders=reshape_colliders(scene.colliders, body, rest))
+
+
+def _contact(garments: int) -> tuple[Effect, ...]:
+    """Contact that searches less far than that of a simulation: a frame's cloth isn't far off."""
+    body = BodyContact(centres=32, spacing=0.045, patch=8)
+    return (body, LayerContact(hops=1, ring=10, patch=6)) if garments > 1 else (body,)
 
 
 def _softness(rate: float) -> float:

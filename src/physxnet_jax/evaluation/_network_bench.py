@@ -13,6 +13,7 @@ from ..data import Sequence as Action
 from ..dressing import EXTERNAL_ENGINES, Precision
 from ..errors import FormatError
 from ..garment import TEMPLATES, Template
+from ..models import read_card
 from ..motion import load_motion
 from ..simulation import PRESETS
 from ._cost import (
@@ -80,6 +81,9 @@ def bench_networks(
             another machine.
     """
     check_rows_file(out)
+    for name in plan.weights:
+        # Wrong weights are reported before a long measurement starts.
+        read_card(str(parse_method(name).weights))
     evaluated = {} if evaluated is None else evaluated
     rows = [_with_evaluated(r, evaluated) for r in _rows_to_keep(plan, out)]
     if times and not rows:

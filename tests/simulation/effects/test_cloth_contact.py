@@ -21,6 +21,7 @@ from physxnet_jax.simulation import (
     simulate,
     standard_effects,
 )
+from physxnet_jax.simulation._effect import Step
 from physxnet_jax.simulation.effects import (
     Bend,
     Gravity,
@@ -214,6 +215,28 @@ def test_self_contact_is_within_each_garment_only():
         near, _ = contact.nearest(jnp.asarray(v, jnp.float32))
         other = (np.asarray(near) >= 36) != (np.arange(72) >= 36)
         assert bool((other & (np.asarray(near) >= 0)).any()) == meet
+
+
+@pytest.mark.parametrize(("held", "share"), [(True, 1.0), (False, 0.5)])
+def test_layers_move_each_vertex_by_its_share(held, share):
+    """Two like sheets, vertex over vertex, pressed together: to the gap, or half of the way each."""
+    low = square_sheet(6, 0.2, upright=True, pinned=np.arange(36) if held else None)
+    high = square_sheet(6, 0.2, upright=True, corner=(0.0, 0.0, 1.505))
+    scene = prepare_scene(Scene((low, high), (LayerContact(gap=0.003, friction=0.0), Pin())))
+    layers = scene.effects[0]
+    x = jnp.asarray(scene.assembly.rest, jnp.float32)[:, :, None]
+    x = x.at[36:].set(x[:36] + jnp.asarray([0.0, 0.0, 0.005])[None, :, None])
+    context = layers.begin(x, None, None, Clock(jnp.float32(0.0), 1 / 30), layers.init_state(1))
+    pressed = jnp.zeros_like(x).at[36:, 2].set(-0.004)
+    step = Step(1 / 240, 1 / 8)
+    moved = layers.project(pressed, pressed, context, jnp.float32(0.5), step)
+    deep = np.asarray((moved - pressed)[:, 2, 0])
+    # 1 mm apart, where 3 are wanted: without friction nothing moves along the sheets.
+    np.testing.assert_allclose(deep[36:], share * 0.002, atol=1e-6)
+    np.testing.assert_allclose(deep[:36], -(1.0 - share) * 0.002, atol=1e-6)
+    assert float(jnp.abs((moved - pressed)[:, :2]).max()) < 1e-6
+    free = layers.project(0 * pressed, 0 * pressed, context, jnp.float32(0.5), step)
+    assert not np.asarray(free).any()
 
 
 @pytest.mark.parametrize(("limbs", "meet"), [((1, 0), True), ((3, 0), True), ((3, 1), False)])

@@ -41,7 +41,7 @@ def test_patches_are_a_partition_of_every_garment(spacing):
     garments = (tailor("tee"), tailor("shorts"))
     scene, guide = prepared(garments, Guide(spacing))
     np.testing.assert_allclose(np.asarray(guide.weight).sum(axis=1), 1.0, atol=1e-5)
-    np.testing.assert_allclose(np.asarray(guide.back_weight).sum(axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.asarray(guide.back_weight).sum(axis=0), 1.0, atol=1e-5)
     first = scene.assembly.parts[1]
     used = np.asarray(guide.weight) > 0.0
     owner = np.asarray(guide.index) >= first

@@ -15,12 +15,12 @@ from ...errors import check_counts, check_numbers
 from ...geometry import (
     closest_barycentric,
     mesh_edges,
-    nearest_index,
     vertex_normals,
 )
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, PosedPoints, Prepared, Rest, SkinnedPoints, Step
+from ._gather import gather_corners, nearest_face, pick_nearest
 from ._pinch import ROOM, Pinch, prepare_pinch
 from ._relief import relief
 from ._samples import Samples, sample_faces, with_samples
@@ -119,7 +119,6 @@ class BodyContact(Effect):
             jnp.asarray(part.astype(np.int32)),
             jnp.asarray(ring.reshape(len(used), -1).T.astype(np.int32)),
             jnp.asarray(near.T.astype(np.int32)),
-            jnp.asarray(np.moveaxis(local[faces[kept]][near], 0, 2)),
             float32(far[:, -1]),
             jnp.asarray(local[faces[kept]]),
             jnp.asarray(tight.astype(np.int32)),
@@ -235,7 +234,6 @@ class _Contact(Prepared):
     part: Int[Array, " points"]
     ring: Int[Array, "ring skin"]
     table: Int[Array, "patch skin"]
-    corners: Int[Array, "patch 3 skin"]
     radius: Float[Array, " skin"]
     faces: Int[Array, "faces 3"]
     tight: Int[Array, " tight"]
@@ -290,7 +288,7 @@ class _Contact(Prepared):
 
         def hop(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             at, _, count = carry
-            to = _pick(points, skin, self.ring[:, at])
+            to = pick_nearest(points, skin, self.ring[:, at])
             return to, jnp.any(to != at), count + 1
 
         def goes_on(carry: tuple[Array, Array, Array]) -> Array:
@@ -307,14 +305,9 @@ class _Contact(Prepared):
     ) -> tuple[Array, Array]:
         """Face and barycentric weights [3, some, batch] of the closest point on a patch."""
         stop = jax.lax.stop_gradient
-        p = jnp.moveaxis(points, 1, 0)
-        # Arithmetic that is fused with gathers or with the search isn't vectorised.
-        apart = jax.lax.optimization_barrier
-        tri = apart(_corners(stop(skin), self.corners[:, :, centre], axis=1))
-        _, squared = closest_barycentric(jnp.broadcast_to(stop(p)[:, None], tri[0].shape), *tri)
-        best = nearest_index(apart(squared))[None]
-        face = jnp.take_along_axis(self.table[:, centre], best, axis=0)[0]
-        weights, _ = closest_barycentric(p, *_corners(skin, self.faces[face], axis=-1))
+        face = nearest_face(stop(points), stop(skin), self.faces, self.table[:, centre])
+        corners = gather_corners(skin, self.faces[face], axis=-1)
+        weights, _ = closest_barycentric(jnp.moveaxis(points, 1, 0), *corners)
         return face, weights
 
     def begin(
@@ -335,7 +328,7 @@ class _Contact(Prepared):
             loose = stop(base[self.loose])
             listed = self.listed[..., None]
             listed = jnp.broadcast_to(listed, (*self.listed.shape, loose.shape[2]))
-            there = self.walk(loose, points, _pick(loose, points, listed))
+            there = self.walk(loose, points, pick_nearest(loose, points, listed))
             last = jnp.concatenate([centre, there])[self.order]
         face, weights = self.closest(base, start.points, last)
         p0, n0 = _surface(start, self.faces, face, weights)
@@ -451,35 +444,6 @@ class _Contact(Prepared):
             "missed": jnp.sum(context.missed & (inside > -0.02), axis=0),
             "pinched": jnp.sum(wanted[:, 0] < 0, axis=0),
         }
-
-
-def _pick(
-    points: Float[Array, "some 3 batch"],
-    skin: Float[Array, "skin 3 batch"],
-    candidates: Int[Array, "candidates some batch"],
-) -> Int[Array, "some batch"]:
-    """The nearest of each point's candidates among the skin vertices."""
-    there = _gather(skin, candidates)
-    x, y, z = (there[i] - points[None, :, i] for i in range(3))
-    gap = x * x + y * y + z * z
-    return jnp.take_along_axis(candidates, nearest_index(gap)[None], axis=0)[0]
-
-
-def _corners(
-    skin: Float[Array, "skin 3 batch"], index: Int[Array, "..."], axis: int
-) -> list[Float[Array, "3 ..."]]:
-    """The three corners of triangles, which the axis of ``index`` lists."""
-    index = jnp.moveaxis(index, axis, 0)
-    return [jnp.stack(_gather(skin, index[k])) for k in range(3)]
-
-
-def _gather(
-    skin: Float[Array, "skin 3 batch"], index: Int[Array, "*some batch"]
-) -> list[Float[Array, "*some batch"]]:
-    """Coordinates of skin vertices, gathered as scalars."""
-    lane = jax.lax.broadcasted_iota(index.dtype, index.shape, index.ndim - 1)
-    flat = index * skin.shape[2] + lane
-    return [skin[:, i].reshape(-1)[flat] for i in range(3)]
 
 
 def _surface(skin: PosedPoints, faces: Array, face: Array, weights: Array) -> tuple[Array, Array]:

@@ -14,6 +14,10 @@ from ...geometry import pad_rows, patch_shares
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, Prepared, Rest, Step
+from ._gather import gather
+
+# Vertices over which the mean of a patch is taken.
+_MEMBERS = 128
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,14 +46,13 @@ class Guide(Effect):
         ]
         shares = sp.csr_matrix(sp.block_diag(parts))
         means = shares.T.multiply(assembly.mass[None]).tocsr()
-        means = sp.diags(1.0 / np.asarray(means.sum(axis=1)).ravel()) @ means
-        index, weight = pad_rows(means)
+        index, weight = _thinned(*pad_rows(means))
         back, back_weight = pad_rows(shares)
         return PreparedGuide(
             jnp.asarray(index),
             float32(weight),
-            jnp.asarray(back),
-            float32(back_weight),
+            jnp.asarray(np.ascontiguousarray(back.T)),
+            float32(np.ascontiguousarray(back_weight.T)),
             jnp.float32(self.time_constant),
         )
 
@@ -80,17 +83,17 @@ class PreparedGuide(Prepared):
     """The patches of a scene's cloth.
 
     Attributes:
-        index: Vertices of each patch, shape [patches, k].
+        index: Vertices that stand for each patch, shape [patches, k].
         weight: Their shares of its mean, shape [patches, k].
-        back: Patches of each vertex, shape [vertices, m].
-        back_weight: Their shares of its correction, shape [vertices, m].
+        back: Patches of each vertex, shape [m, vertices].
+        back_weight: Their shares of its correction, shape [m, vertices].
         time_constant: See `Guide` [s].
     """
 
     index: Int[Array, "patches k"]
     weight: Float[Array, "patches k"]
-    back: Int[Array, "vertices m"]
-    back_weight: Float[Array, "vertices m"]
+    back: Int[Array, "m vertices"]
+    back_weight: Float[Array, "m vertices"]
     time_constant: Float[Array, ""]
 
     def means(self, values: Float[Array, "vertices n batch"]) -> Float[Array, "patches n batch"]:
@@ -143,14 +146,25 @@ class PreparedGuide(Prepared):
         away = begin + progress * way - at
         slower = (step.share * way - gone) * (step.length / substep)
         pull = (r * r * away + 2.0 * r * slower) / (1.0 + 2.0 * r + r * r)
-        return displacement + state.on * _combine(pull, self.back, self.back_weight)
+        share = self.back_weight[..., None]
+        rows = jnp.broadcast_to(self.back[..., None], (*self.back.shape, pull.shape[2]))
+        moves = [jnp.sum(share * p, axis=0) for p in gather(pull, rows)]
+        return displacement + state.on * jnp.stack(moves, axis=1)
 
 
-def _combine(values: Array, index: Array, weight: Array) -> Array:
-    out = jnp.zeros((), values.dtype)
-    for k in range(index.shape[1]):
-        out = out + weight[:, k, None, None] * values[index[:, k]]
-    return out
+def _thinned(
+    index: Int[np.ndarray, "patches n"], weight: Float[np.ndarray, "patches n"]
+) -> tuple[Int[np.ndarray, "patches k"], Float[np.ndarray, "patches k"]]:
+    """At most so many vertices of each patch: the others would hardly change its mean."""
+    size = min(_MEMBERS, index.shape[1])
+    kept, share = np.zeros((len(index), size), index.dtype), np.zeros((len(index), size))
+    # Drawn at random, since any regular choice can be in step with the mesh.
+    rng = np.random.default_rng(0)
+    for row, count in enumerate((weight > 0).sum(axis=1)):
+        drawn = rng.permutation(count)[:size]
+        kept[row, : len(drawn)] = index[row, drawn]
+        share[row, : len(drawn)] = weight[row, drawn]
+    return kept, share / share.sum(axis=1, keepdims=True)
 
 
 def faces_between(

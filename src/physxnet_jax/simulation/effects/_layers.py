@@ -13,7 +13,8 @@ from ...errors import check_counts, check_numbers
 from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly, float32
-from .._effect import Clock, Effect, Prepared
+from .._effect import Clock, Effect, Prepared, Step
+from ._gather import pick_nearest
 from ._limbs import adjoining, limb_labels
 from ._pairs import (
     ClothContact,
@@ -21,10 +22,10 @@ from ._pairs import (
     Pairs,
     closest_of,
     foot_of,
-    rows_of,
     side_normal,
     smooth_normals,
     towards,
+    wanted_height,
 )
 
 # Vertices farther than this from the other garment at rest never touch it [m].
@@ -46,7 +47,8 @@ class LayerContact(Effect):
     is known, so a vertex on the wrong side is moved back instead of being kept there, unless
     the layers face each other, as folds do.
     Vertices of the outer garment are tested against triangles of the inner one, and
-    vertices of the inner one against triangles of the outer one.
+    vertices of the inner one against triangles of the outer one. Of each pair only the vertex
+    moves, by its share of the distance: the triangle's corners have pairs of their own.
 
     Attributes:
         gap: Distance kept between layers [m].
@@ -113,14 +115,15 @@ class LayerContact(Effect):
             jnp.asarray(np.concatenate(rows).astype(np.int32)),
             jnp.asarray(np.concatenate(start).astype(np.int32)),
             float32(np.concatenate(side)[:, None, None]),
-            jnp.asarray(ring),
-            jnp.asarray(patch),
+            jnp.asarray(ring.T),
+            jnp.asarray(patch.T),
             jnp.asarray(outwards.astype(np.int32)),
             float32(rim),
             jnp.asarray(label.astype(np.int32)),
             jnp.asarray(adjoining()),
             jnp.asarray(inverse_mass)[:, None, None],
             self,
+            (0, *(int(n) for n in np.cumsum([len(r) for r in rows]))),
         )
 
 
@@ -139,14 +142,15 @@ class _Layers(ClothContact):
     rows: Int[Array, " pairs"]
     start: Int[Array, " pairs"]
     side: Float[Array, "pairs 1 1"]
-    ring: Int[Array, "vertices ring"]
-    patch: Int[Array, "vertices patch"]
+    ring: Int[Array, "ring vertices"]
+    patch: Int[Array, "patch vertices"]
     faces: Int[Array, "faces 3"]
     rim: Float[Array, " vertices"]
     label: Int[Array, " vertices"]
     adjoining: Array
     inverse_mass: Float[Array, "vertices 1 1"]
     law: LayerContact = dataclasses.field(metadata={"static": True})
+    blocks: tuple[int, ...] = dataclasses.field(metadata={"static": True})
 
     def init_state(self, batch: int) -> Int[Array, "pairs batch"]:
         return jnp.repeat(self.start[:, None], batch, axis=1)
@@ -156,11 +160,8 @@ class _Layers(ClothContact):
         points = x[self.rows]
         at = state
         for _ in range(self.law.hops):
-            ring = self.ring[at]
-            gap = rows_of(x, jnp.moveaxis(ring, 2, 1)) - points[:, None]
-            best = jnp.argmin(jnp.sum(gap * gap, axis=2), axis=1)
-            at = jnp.take_along_axis(ring, best[..., None], axis=2)[..., 0]
-        corners, weights = closest_of(x, points, self.faces[self.patch[at]])
+            at = pick_nearest(points, x, self.ring[:, at])
+        corners, weights = closest_of(points, x, self.faces, self.patch[:, at])
         foot = foot_of(x, corners, weights)
         offset = points - foot
         flat = side_normal(x, corners)
@@ -187,6 +188,36 @@ class _Layers(ClothContact):
         pairs = Pairs(vertex, corners, weights, n, height, active.astype(base.dtype))
         watched = (over & (height > -_MAX_REPORTED)).astype(base.dtype)
         return Facing(pairs, clock, at, watched)
+
+    def project(
+        self,
+        displacement: Array,
+        start: Array,
+        context: Facing,
+        progress: Array,
+        step: Step,
+    ) -> Array:
+        pairs, law = context.pairs, self.law
+        n, weights = pairs.normal, pairs.weights
+        mine = self.inverse_mass[self.rows]
+        theirs = jnp.sum(weights**2 * self.inverse_mass[pairs.corners, 0, 0], axis=0)[:, None]
+        share = mine / (mine + theirs + 1e-9)
+        relative = displacement[self.rows] - foot_of(displacement, pairs.corners, weights)
+        before = start[self.rows] - foot_of(start, pairs.corners, weights)
+        height = pairs.height + jnp.sum(relative * n, axis=1, keepdims=True)
+        wanted = wanted_height(pairs.height, law, progress * context.clock.length)
+        depth = jnp.maximum(wanted - height, 0.0) * pairs.active
+        slide = relative - before
+        slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
+        length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
+        hold = jnp.minimum(1.0, law.friction * depth / length)
+        move = share * (depth * n - hold * slide)
+        for i, j in zip(self.blocks, self.blocks[1:]):
+            rows = self.rows[i:j]
+            displacement = displacement.at[rows].add(
+                move[i:j], unique_indices=True, indices_are_sorted=True
+            )
+        return displacement
 
     def diagnose(self, displacement: Array, context: Facing) -> dict[str, Array]:
         pairs = context.pairs

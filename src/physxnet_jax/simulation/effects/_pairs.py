@@ -3,12 +3,14 @@
 import dataclasses
 from typing import Any, Protocol, runtime_checkable
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from ...geometry import closest_barycentric
 from ...typing import pytree
 from .._effect import Clock, Prepared, Step
+from ._gather import gather, gather_corners, nearest_face
 
 # Pairs that are too close approach their gap within this time [s].
 _SETTLING = 0.1
@@ -105,33 +107,38 @@ class ClothContact(Prepared):
 
 def rows_of(x: Float[Array, "vertices 3 batch"], index: Int[Array, "... batch"]) -> Array:
     """Rows of each batch member, shape [..., 3, batch]."""
-    lane = jnp.arange(x.shape[2]).reshape((1,) * (index.ndim - 1) + (-1,))
-    out = x[index, :, lane]
-    return jnp.moveaxis(out, -1, -2)
+    return jnp.stack(gather(x, index), axis=-2)
 
 
 def closest_of(
-    x: Float[Array, "vertices 3 batch"],
     points: Float[Array, "pairs 3 batch"],
-    patch: Int[Array, "pairs batch k 3"],
+    x: Float[Array, "vertices 3 batch"],
+    faces: Int[Array, "faces 3"],
+    patch: Int[Array, "k pairs batch"],
 ) -> tuple[Array, Array]:
     """The closest of k triangles for each point: corners and weights, [3, pairs, batch]."""
-    batch = x.shape[2]
-    # [3, k, pairs, batch], flattened so that each gather reads scalars.
-    corner = jnp.moveaxis(patch, (3, 2), (0, 1))
-    flat = [x[:, i].reshape(-1) for i in range(3)]
-    at = corner * batch + jnp.arange(batch, dtype=jnp.int32)[None, None, None]
-    tri = [jnp.stack([f[at[k]] for f in flat]) for k in range(3)]
-    p = jnp.broadcast_to(jnp.moveaxis(points, 1, 0)[:, None], tri[0].shape)
-    weights, squared = closest_barycentric(p, *tri)
-    best = jnp.argmin(squared, axis=0)[None, None]
-    corner = jnp.take_along_axis(corner, best, axis=1)[:, 0]
-    return corner, jnp.take_along_axis(weights, best, axis=1)[:, 0]
+    corners = jnp.moveaxis(faces[nearest_face(points, x, faces, patch)], -1, 0)
+    tri = jax.lax.optimization_barrier(gather_corners(x, corners, axis=0))
+    return corners, closest_barycentric(jnp.moveaxis(points, 1, 0), *tri)[0]
 
 
 def foot_of(x: Float[Array, "vertices 3 batch"], corners: Array, weights: Array) -> Array:
     """Points on triangles, shape [pairs, 3, batch]."""
     return sum(w[:, None] * rows_of(x, c) for w, c in zip(weights, corners, strict=True))  # pyright: ignore[reportReturnType]
+
+
+def wanted_height(
+    height: Float[Array, "pairs 1 batch"], law: Spacing, time: Array
+) -> Float[Array, "pairs 1 batch"]:
+    """Height that pairs keep [m]: the gap, which those too close at the start approach with time.
+
+    Args:
+        height: Height at the start of the contact interval [m].
+        law: Gap and speed of separation.
+        time: Time since then [s].
+    """
+    speed = jnp.clip((law.gap - height) / _SETTLING, 0.0, law.leave)
+    return jnp.minimum(law.gap, height + speed * time)
 
 
 def separate_pairs(
@@ -165,8 +172,7 @@ def separate_pairs(
     n = pairs.normal
     relative = pairs.motion(displacement)
     height = pairs.heights(displacement)
-    speed = jnp.clip((law.gap - pairs.height) / _SETTLING, 0.0, law.leave)
-    target = jnp.minimum(law.gap, pairs.height + speed * progress * clock.length)
+    target = wanted_height(pairs.height, law, progress * clock.length)
     depth = jnp.maximum(target - height, 0.0) * pairs.active
     inertia = sum(s[:, None] ** 2 * w for s, w in zip(share, mass, strict=True))
     lift = depth / (inertia + 1e-9)

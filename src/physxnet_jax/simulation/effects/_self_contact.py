@@ -69,7 +69,7 @@ class SelfContact(Effect):
             jnp.asarray(n.astype(np.float32)),
             jnp.asarray(connected_components(f, len(x))),
             jnp.asarray(part.astype(np.int32)),
-            jnp.asarray(f.astype(np.int32)[vertex_faces(f, len(x))]),
+            jnp.asarray(vertex_faces(f, len(x)).T.astype(np.int32)),
             jnp.asarray(f.astype(np.int32)),
             jnp.asarray(inverse_mass)[:, None, None],
             self,
@@ -85,7 +85,7 @@ class _SelfContact(ClothContact):
     facing: Float[Array, "vertices 3"]
     piece: Int[Array, " vertices"]
     part: Int[Array, " vertices"]
-    around: Int[Array, "vertices degree 3"]
+    around: Int[Array, "degree vertices"]
     faces: Int[Array, "faces 3"]
     inverse_mass: Float[Array, "vertices 1 1"]
     law: SelfContact = dataclasses.field(metadata={"static": True})
@@ -108,7 +108,8 @@ class _SelfContact(ClothContact):
         own = jnp.arange(base.shape[0], dtype=near.dtype)
         vertex = jnp.repeat(jnp.concatenate([own, own])[:, None], batch, axis=1)
         found = (near >= 0)[:, None]
-        corners, weights = closest_of(x, jnp.concatenate([x, x]), self.around[jnp.maximum(near, 0)])
+        around = self.around[:, jnp.maximum(near, 0)]
+        corners, weights = closest_of(jnp.concatenate([x, x]), x, self.faces, around)
         offset = jnp.concatenate([x, x]) - foot_of(x, corners, weights)
         length = jnp.sqrt(jnp.sum(offset * offset, axis=1, keepdims=True) + 1e-18)
         # Coincident points have no direction: use the triangle's normal.
