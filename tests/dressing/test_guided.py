@@ -1,4 +1,4 @@
-"""Guided simulation: it starts as predicted, streams, starts anew, and obeys fabric and wind."""
+"""Guided simulation: it starts near the prediction, streams, starts anew, and obeys fabric and wind."""
 
 import dataclasses
 import functools
@@ -21,6 +21,7 @@ from physxnet_jax.dressing import (
 )
 from physxnet_jax.dressing._guided import _softness
 from physxnet_jax.errors import FormatError, PhysXNetError
+from physxnet_jax.geometry import mesh_edges
 from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import STANDARD
 from physxnet_jax.simulation.effects import Guide
@@ -50,15 +51,22 @@ def step(dresser, stream, q, p, fps=30.0):
     return clothe_step(dresser, stream, q, p, fps)
 
 
-def test_the_first_frame_is_the_prediction_outside_the_body(guided, motion):
-    """Later frames are the simulation's."""
+def test_the_first_frame_is_skinned_cloth_near_the_prediction(guided, motion):
+    """Smooth, with its patches where they are predicted; later frames are the simulation's."""
     q, p = motion.rotations[:FRAMES], motion.root[:FRAMES]
     bare = Inference(weights="nano", strain_iterations=0)
     predicted = clothe(make_dresser(["bottom"], inference=bare), q, p, 30.0)["bottom"]
     found = cloth_of(guided, q, p)
     assert bool(found.ok.all())
-    gap = np.linalg.norm(found["bottom"] - predicted, axis=2).max(axis=1)
-    assert gap[0] < 1e-6 and (gap[1:] > 1e-3).all()
+    skinned = clothe(make_dresser(["bottom"], method="lbs"), q, p, 30.0)["bottom"]
+    edges = mesh_edges(np.asarray(guided.garments[0].mesh.faces)).vertices
+
+    def roughness(x):
+        """Differences along edges over those of skinned cloth [m]."""
+        off = np.asarray(x - skinned)[0]
+        return np.linalg.norm(off[edges[:, 0]] - off[edges[:, 1]], axis=1).mean()
+
+    assert roughness(found["bottom"]) < 0.7 * roughness(predicted)
     # The patches are still where they are predicted, nearly.
     scene = guided.guided
     means = [
@@ -66,7 +74,7 @@ def test_the_first_frame_is_the_prediction_outside_the_body(guided, motion):
         for x in (found["bottom"], predicted)
     ]
     away = np.linalg.norm(np.asarray(means[0] - means[1])[..., 0], axis=2)
-    assert away[-1].mean() < 0.01
+    assert away[0].mean() < 4e-3 and away[-1].mean() < 0.01
 
 
 def test_a_stream_gives_the_clip(guided, motion):

@@ -105,7 +105,7 @@ class GuidedState:
         rotations: World rotations of joints.
         translations: World translations of joints [m].
         time: Time since the first frame [s].
-        ready: Whether there is cloth to go on from; else it starts as predicted.
+        ready: Whether there is cloth to go on from; else it starts near the prediction.
     """
 
     cloth: State
@@ -179,7 +179,7 @@ def reshape_guided(
 
 
 def _contact(garments: int) -> tuple[Effect, ...]:
-    """Contact that searches less far than that of a simulation: a frame's cloth isn't far off."""
+    """Contact that searches less far than a simulation's: the network keeps cloth near."""
     body = BodyContact(centres=32, spacing=0.045, patch=8)
     return (body, LayerContact(hops=1, ring=10, patch=6)) if garments > 1 else (body,)
 
@@ -203,7 +203,7 @@ def init_guided(
     rotations: Float[Array, "joints 3 3"],
     translations: Float[Array, "joints 3"],
 ) -> GuidedState:
-    """The state before the first frame, which starts as predicted, but outside the body.
+    """The state before the first frame, whose cloth is skinned and moved towards the prediction.
 
     Args:
         scene: From `prepare_guided`.
@@ -269,19 +269,20 @@ def advance_guided(
         )[0]
 
     def start(_: None) -> State:
-        # As fast as the garment's skinning.
-        moved = tuple(
-            skin_garment(w, rotations, translations)
-            - skin_garment(w, state.rotations, state.translations)
-            for w in worn
+        # Skinned cloth, whose patches lie where they are predicted: a prediction's own hems are
+        # ragged. As fast as its skinning.
+        skinned, before = (
+            scene.joined(tuple(skin_garment(w, r, t) for w in worn))
+            for r, t in ((rotations, translations), (state.rotations, state.translations))
         )
+        place = skinned + scene.guide.spread(means - scene.guide.means(skinned))
         # Outside the skin: what begins within shows for many frames.
-        cloth = tuple(x[None] for x in predicted)
+        cloth = tuple(x[None] for x in scene.parted(place))
         cloth = apply_contacts(
             scene.colliders, scene.layers, cloth, rotations[None], translations[None]
         )
         place = scene.joined(tuple(x[0] for x in cloth))
-        begun = start_state(system, place, fps * scene.joined(moved), solver=solver, fps=fps)
+        begun = start_state(system, place, fps * (skinned - before), solver=solver, fps=fps)
         # Both branches must have one type: `start_state` gives weak ones.
         return jax.tree.map(lambda a, b: jnp.asarray(a, b.dtype), begun, state.cloth)
 

@@ -81,11 +81,11 @@ def bench_networks(
             another machine.
     """
     check_rows_file(out)
+    evaluated = {} if evaluated is None else evaluated
+    rows = [_with_evaluated(r, evaluated) for r in _rows_to_keep(plan, out)]
     for name in plan.weights:
         # Wrong weights are reported before a long measurement starts.
         read_card(str(parse_method(name).weights))
-    evaluated = {} if evaluated is None else evaluated
-    rows = [_with_evaluated(r, evaluated) for r in _rows_to_keep(plan, out)]
     if times and not rows:
         raise FormatError("only existing rows can be timed again, but there are none.")
     recorded = recorded_machine(out)

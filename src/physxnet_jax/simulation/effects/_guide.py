@@ -100,6 +100,12 @@ class PreparedGuide(Prepared):
         """Means of vertices over the patches."""
         return jnp.einsum("pk,pkcb->pcb", self.weight, values[self.index])
 
+    def spread(self, moves: Float[Array, "patches 3 batch"]) -> Float[Array, "vertices 3 batch"]:
+        """Moves of patches, interpolated at the vertices."""
+        rows = jnp.broadcast_to(self.back[..., None], (*self.back.shape, moves.shape[2]))
+        share = self.back_weight[..., None]
+        return jnp.stack([jnp.sum(share * m, axis=0) for m in gather(moves, rows)], axis=1)
+
     def reshaped(self, rest: Rest) -> Prepared:
         # Patches are of vertices, and weigh them as they were.
         return self
@@ -146,10 +152,7 @@ class PreparedGuide(Prepared):
         away = begin + progress * way - at
         slower = (step.share * way - gone) * (step.length / substep)
         pull = (r * r * away + 2.0 * r * slower) / (1.0 + 2.0 * r + r * r)
-        share = self.back_weight[..., None]
-        rows = jnp.broadcast_to(self.back[..., None], (*self.back.shape, pull.shape[2]))
-        moves = [jnp.sum(share * p, axis=0) for p in gather(pull, rows)]
-        return displacement + state.on * jnp.stack(moves, axis=1)
+        return displacement + state.on * self.spread(pull)
 
 
 def _thinned(
