@@ -4,8 +4,9 @@ Command: python experiments/compare_methods.py
          --weights base (default), --file GARMENT (default: F_Dress_01.obj in garments of
          $PHYSXNET_DATA or ../shared), --frames 90, --out out
 Cost:    about ten minutes on two cores, most of it the converged simulation.
-Result:  OUT/compare_ACTION.mp4 for a soft and an abrupt action, with the shirt over the trousers,
-         the A-line dress and the file, and OUT/compare.png: frames of all of them.
+Result:  OUT/compare_ACTION_OUTFIT.png for a soft and an abrupt action in the shirt over the
+         trousers, the A-line dress and the file, OUT/compare.png, all of these, and
+         OUT/compare_ACTION_dress.mp4.
 """
 
 import argparse

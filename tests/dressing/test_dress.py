@@ -25,18 +25,20 @@ def test_lbs_is_linear_blend_skinning(body, rest):
 
 @pytest.mark.release
 def test_network_cloth_differs_from_skinning_and_stays_near_the_body():
-    a = dress("walk", ["bottom", "dress"], method="network", frames=20)
+    # Weights that learned these fitted garments.
+    fitted = Inference(weights="small")
+    a = dress("walk", ["bottom", "dress"], method="network", inference=fitted, frames=20)
     b = dress("walk", ["bottom", "dress"], method="lbs", frames=20)
     for x, y in zip(a.garments, b.garments):
         gap = np.linalg.norm(x.positions - y.positions, axis=2)
         assert np.isfinite(gap).all() and 1e-3 < gap.mean() < 0.1 and gap.max() < 0.5
     assert a.hit_rate["bottom"] > 0.95 and a.fallbacks["bottom"] is not None
     assert all(v < 0.02 for v in a.inside.values())
-    # A hem swings with the steps, slower than the legs at over a metre a second.
+    # A hem swings with the steps; leaps of centimetres between frames told of jerked hips.
     hem = np.argsort(a.garments[1].positions[0, :, 1])[:40]
     hips = np.asarray(load_motion("walk", fps=30.0).root)[:20, 1]
     height = a.garments[1].positions[:, hem, 1].mean(axis=1) - hips
-    assert np.abs(np.diff(height)).max() < 0.035 and np.ptp(height) > 0.02
+    assert np.abs(np.diff(height)).max() < 0.025 and np.ptp(height) > 0.02
     assert {s.name for s in a.stages} >= {"motion", "binding", "network", "body"}
 
 
