@@ -62,7 +62,7 @@ def test_wheel_contains_only_the_package_with_weights_types_and_licence(wheel):
     with zipfile.ZipFile(wheel) as file:
         names = file.namelist()
     assert "physxnet_jax/py.typed" in names
-    assert any(n.endswith("weights/local/weights.safetensors") for n in names)
+    assert any(n.endswith("weights/base/weights.safetensors") for n in names)
     assert any(n.endswith("licenses/LICENSE") for n in names)
     roots = {n.split("/")[0] for n in names}
     assert roots == {"physxnet_jax", f"physxnet_jax-{physxnet_jax.__version__}.dist-info"}

@@ -5,6 +5,7 @@ import pathlib
 import re
 import runpy
 
+import numpy as np
 import pytest
 
 from physxnet_jax.cli import main
@@ -56,5 +57,6 @@ def test_readme_python_examples_run(tmp_path, monkeypatch):
     for code in blocks:
         short = code.replace("frames=30", "frames=3").replace("rotations,", "rotations[:3],")
         exec(short.replace("root,", "root[:3],"), there)
-    assert (tmp_path / "walk.npz").is_file()
-    assert there["trousers"].shape == (3, 2726, 3)
+    with np.load(tmp_path / "walk.npz") as written:
+        assert there["trousers"].shape == written["trousers_positions"].shape
+    assert len(there["trousers"]) == 3

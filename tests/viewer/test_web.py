@@ -201,7 +201,10 @@ def test_maps_display_velocity_and_acceleration():
 
 @pytest.mark.release
 def test_live_cloth_matches_the_clip_from_any_frame(viewer):
-    choice = Choice("walk", ("bottom",), inference=Inference(weights="nano"), frames=12, live=True)
+    nano = Inference(weights="nano")
+    choice = Choice(
+        "walk", ("bottom",), method="network", inference=nano, frames=12, fps=30.0, live=True
+    )
     shown = run_job(choice)
     assert shown.live is not None and np.isnan(shown.live.milliseconds)
     clip = shown.garments[0].positions
@@ -210,6 +213,12 @@ def test_live_cloth_matches_the_clip_from_any_frame(viewer):
         assert np.abs(live - clip[frame]).max() < 1e-5, frame
     assert np.abs(live - clip[9]).max() > 0.01, "the clip moves"
     assert 0 < shown.live.milliseconds < np.inf
+    # Guided cloth has a past: frame after frame it is the clip's, elsewhere it starts anew.
+    guided = run_job(dataclasses.replace(choice, method="guided"))
+    for frame in (0, 1, 2):
+        live = guided.live.frame(frame)["bottom"]
+        assert np.abs(live - guided.garments[0].positions[frame]).max() < 1e-4, frame
+    assert np.isfinite(guided.live.frame(9)["bottom"]).all()
     # What only the network can answer isn't asked of skinning.
     assert run_job(dataclasses.replace(SHORT, live=True)).live is None
 

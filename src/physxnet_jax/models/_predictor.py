@@ -147,12 +147,17 @@ class Predictor:
         """The atlas of the maps of motion."""
         return self.atlas if self.coarse_atlas is None else self.coarse_atlas
 
+    @property
+    def _dtype(self) -> jnp.dtype:
+        """The type of all parameters: float32, or that set by `at_precision`."""
+        return jax.tree.leaves(self.state)[0].dtype
+
     def modulation(
         self, template: str, conditions: Float[Array, "height width channels"]
     ) -> Modulation:
         """What the maps of a garment change in its decoder, see `condition_maps`."""
         network = nnx.merge(self.graph, self.state)
-        return network.modulation(template, conditions[None])
+        return network.modulation(template, conditions[None].astype(self._dtype))
 
     def __call__(
         self,
@@ -200,9 +205,7 @@ class Predictor:
         """Offsets [m] from normalised features, see `normalise`."""
         network = nnx.merge(self.graph, self.state)
         network.eval()
-        # All parameters have one type: float32, or that set by `at_precision`.
-        dtype = jax.tree.leaves(self.state)[0].dtype
-        maps = self.motion_atlas.to_map(features).astype(dtype)
+        maps = self.motion_atlas.to_map(features).astype(self._dtype)
         if modulation is None:
             if self.mirror_tta:
                 maps = jnp.concatenate([maps, _mirror_maps(maps)])
