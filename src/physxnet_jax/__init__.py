@@ -29,12 +29,15 @@ if not (_is_command(_sys.argv) and _sys.argv[1:2] == ["doctor"]):
 if _TYPE_CHECKING:
     from .body import Body as Body, load_body as load_body
     from .dressing import (
+        AdaptConfig as AdaptConfig,
+        Adapted as Adapted,
         Character as Character,
         Clothed as Clothed,
         DressedClip as DressedClip,
         Dresser as Dresser,
         Inference as Inference,
         Simulation as Simulation,
+        adapt as adapt,
         clothe as clothe,
         clothe_step as clothe_step,
         dress as dress,
@@ -84,12 +87,15 @@ _PACKAGES = {
         "load_body",
     ),
     "dressing": (
+        "AdaptConfig",
+        "Adapted",
         "Character",
         "Clothed",
         "DressedClip",
         "Dresser",
         "Inference",
         "Simulation",
+        "adapt",
         "clothe",
         "clothe_step",
         "dress",

@@ -103,6 +103,15 @@ def test_candidate_search_matches_brute_force(body):
     miss = np.sqrt(np.asarray(quick.squared_distance)) - np.sqrt(np.asarray(exact.squared_distance))
     assert (miss > -1e-5).all()
     assert (miss > 1e-5).mean() < 0.01 and miss.max() < 2e-3
+    # Compared exactly only where the middles are nearest: nearly always the same point.
+    few = closest_among(mesh, jnp.asarray(points), jnp.asarray(near), exactly=3)
+    more = np.sqrt(np.asarray(few.squared_distance)) - np.sqrt(np.asarray(quick.squared_distance))
+    assert (more > -1e-6).all() and (more > 1e-4).mean() < 0.02 and more.max() < 3e-3
+    assert (np.asarray(few.face)[:, None] == near).any(axis=1).all()
+    # The control: the nearest middle alone.
+    one = closest_among(mesh, jnp.asarray(points), jnp.asarray(near), exactly=1)
+    worse = np.sqrt(np.asarray(one.squared_distance)) - np.sqrt(np.asarray(quick.squared_distance))
+    assert (worse > 1e-4).mean() > 0.05
 
 
 def test_fast_argmin_matches_argmin():

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from physxnet_jax.garment import tailor, template
+from physxnet_jax.garment import refine_garment, tailor, template
 from physxnet_jax.uv import CONDITIONS, bind, condition_maps, make_atlas
 
 
@@ -66,6 +66,16 @@ def test_cotton_is_zero_and_other_fabrics_are_not(seen):
     assert silk["density"][there].max() < -0.3 and silk["stretch"][there].min() > 0.2
     for same in ("covered", "distance to the skin", "cloth over skin"):
         np.testing.assert_allclose(silk[same], plain[same], atol=1e-6)
+
+
+def test_a_coarse_mesh_is_seen_as_a_fine_one(seen):
+    coarse = template("bottom")
+    fine = seen(refine_garment(coarse, 0.015))
+    found = seen(coarse)
+    both = (fine["covered"] > 0) & (found["covered"] > 0)
+    assert both.sum() > 0.97 * max((fine["covered"] > 0).sum(), (found["covered"] > 0).sum())
+    for name in ("distance to the skin", "cloth over skin", "distance to the border"):
+        assert np.abs(fine[name] - found[name])[both].mean() < 0.03, name
 
 
 def test_garments_without_borders_and_of_templates_are_described(seen):

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ._options import QuietTerminal, RayAddress, Terminal
+from ._options import Fabric, QuietTerminal, RayAddress, Terminal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Bench:
     """Measure accuracy against time of solvers and settings, or of networks.
 
     Examples:
-      physxnet bench net --weights nano small local --data runs/ours --out out/net.json
+      physxnet bench net --weights nano small base --data runs/ours --out out/net.json
       physxnet bench sim --out out/sim_bench.json
       physxnet bench sim --scenes sheet
       physxnet bench sim --blender 5 10 15 20 --shirt shirt.obj --motion punch.bvh
@@ -152,6 +152,44 @@ class Train:
     name: str | None = None
     """Name of the weights; by default the configuration's table or file name."""
     terminal: QuietTerminal = dataclasses.field(default_factory=QuietTerminal)
+
+
+@dataclasses.dataclass(frozen=True)
+class Adapt:
+    """Fine-tune a network to one garment: by its physics, or by simulations of it.
+
+    Other garments of the same template are predicted worse afterwards. An interrupted run resumes
+    if the same command is run again.
+
+    Examples:
+      physxnet adapt my_coat.obj --fabric wool -o coat
+      physxnet adapt my_skirt.obj --simulate --motions dance.bvh -o skirt
+      physxnet dress dance.bvh --wear my_coat.obj:fabric=wool --weights coat -o dance.usdc
+    """
+
+    garment: tyro.conf.Positional[str]
+    """A garment file, a tailored garment or a template, with options after a colon."""
+    out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for the weights."""
+    fabric: Fabric | None = None
+    """Fabric, if the garment names none."""
+    weights: str = "base"
+    """Name or folder of the weights to start from."""
+    simulate: bool = False
+    """Simulate the garment on all motions, and learn from that as well."""
+    motions: tuple[str, ...] = ()
+    """Motions to learn from, beside the built-in clips."""
+    held_out: str = "punch"
+    """Motion by which the best network is chosen, and the gain measured."""
+    frames: int | None = None
+    """Use at most so many frames of each motion."""
+    shape: tuple[str, ...] = ()
+    """Shape parameters of the body, as name=value: gender=1 weight_up=0.5 …"""
+    steps: int = 1000
+    """Steps of the optimizer."""
+    seed: int = 0
+    """Seed of the frames' order."""
+    terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -26,7 +26,7 @@ from ._commands import (
     Tailor,
     View,
 )
-from ._experiment_commands import Bench, Dataset, Evaluate, Stress, Train
+from ._experiment_commands import Adapt, Bench, Dataset, Evaluate, Stress, Train
 
 
 class _Handler(NamedTuple):
@@ -54,6 +54,7 @@ _COMMANDS: dict[str, _Handler] = {
     "stress": _Handler(Stress, "_stress", "stress", _SIMULATE),
     "dataset": _Handler(Dataset, "_dataset", "dataset", _LEARN),
     "train": _Handler(Train, "_train", "train", _LEARN),
+    "adapt": _Handler(Adapt, "_adapt", "run_adapt", _LEARN),
     "evaluate": _Handler(Evaluate, "_evaluate", "evaluate", _LEARN),
     "bench": _Handler(Bench, "_bench", "bench", _LEARN),
     "calibrate": _Handler(Calibrate, "_calibrate", "calibrate", _SYSTEM),
@@ -123,7 +124,7 @@ def _resumes(command: object) -> bool:
         return command.out is not None and not command.times
     if isinstance(command, Dataset):
         return command.what == "build"
-    return isinstance(command, Train | Calibrate)
+    return isinstance(command, Train | Adapt | Calibrate)
 
 
 def parse(arguments: Sequence[str] | None = None) -> Any:

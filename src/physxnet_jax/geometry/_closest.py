@@ -145,6 +145,8 @@ def closest_among(
     mesh: TriMesh,
     points: Float[Array, "points 3"],
     candidates: Int[Array, "points k"],
+    *,
+    exactly: int | None = None,
 ) -> ClosestPoints:
     """Finds closest points among a short list of faces for each point.
 
@@ -152,6 +154,8 @@ def closest_among(
         mesh: The mesh.
         points: Query points [m].
         candidates: Faces to compare, shape [points, k].
+        exactly: Compare only so many exactly, those with the nearest middles: several times as
+            fast, and right where triangles are of similar size. All if None.
 
     Returns:
         As `closest_points`, over the candidates only.
@@ -159,10 +163,34 @@ def closest_among(
     corners = mesh.vertices[mesh.faces].reshape(-1, 9)
     p = points.T
     # Only the chosen triangle is differentiated: a gradient through all takes too much memory.
-    face = _nearest(jax.lax.stop_gradient(corners), jax.lax.stop_gradient(p), candidates)
+    fixed, at = jax.lax.stop_gradient((corners, p))
+    if exactly is not None and exactly < candidates.shape[1]:
+        candidates = _nearest_middles(fixed, at, candidates, exactly)
+    face = _nearest(fixed, at, candidates)
     a, b, c = corners[face].T.reshape(3, 3, -1)
     weights, squared = closest_barycentric(p, a, b, c)
     return ClosestPoints(face, weights.T, squared)
+
+
+def _nearest_middles(
+    corners: Float[Array, "faces 9"],
+    p: Float[Array, "3 points"],
+    candidates: Int[Array, "points k"],
+    count: int,
+) -> Int[Array, "points count"]:
+    """Those of each point's candidates whose middles are nearest."""
+    # Arithmetic that is fused with gathers or with the search isn't vectorised.
+    apart = jax.lax.optimization_barrier
+    order = candidates.T
+    middles = apart(jnp.sum(corners.reshape(-1, 3, 3), axis=1) / 3.0)
+    there = apart([m[order] for m in middles.T])
+    gap = sum((m - q[None]) ** 2 for m, q in zip(there, p, strict=True))
+    chosen = []
+    for _ in range(count):
+        chosen.append(jnp.take_along_axis(order, nearest_index(apart(gap))[None], axis=0))
+        # A list may name a triangle twice.
+        gap = jnp.where(order == chosen[-1], jnp.inf, gap)
+    return jnp.concatenate(chosen).T
 
 
 def _nearest(

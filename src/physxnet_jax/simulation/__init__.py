@@ -15,7 +15,9 @@ from ._effect import (
     Prepared as Prepared,
 )
 from ._implicit import Implicit as Implicit
+from ._potential import incremental_potential as incremental_potential
 from ._prepared_scene import PreparedScene as PreparedScene
+from ._resume import fingerprint as fingerprint
 from ._rollout import (
     PRESETS as PRESETS,
     ROLLOUT_BLOCK as ROLLOUT_BLOCK,

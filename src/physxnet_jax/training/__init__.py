@@ -1,5 +1,6 @@
 """Training: losses, step, loop, checkpoints."""
 
+from ._checkpoint import Checkpoints as Checkpoints
 from ._config import TrainConfig as TrainConfig
 from ._loop import train as train
 from ._losses import (

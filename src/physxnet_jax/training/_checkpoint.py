@@ -3,13 +3,24 @@
 import dataclasses
 import json
 import pathlib
-from typing import Any
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import jax
 import orbax.checkpoint as ocp
 
 from ..errors import PhysXNetError
-from ._problem import TrainState
+
+
+@runtime_checkable
+class Stepped(Protocol):
+    """A pytree that counts its steps, such as `TrainState`."""
+
+    @property
+    def step(self) -> Any:
+        """Steps done."""
+
+
+State = TypeVar("State", bound=Stepped)
 
 
 class Checkpoints:
@@ -28,7 +39,7 @@ class Checkpoints:
             ),
         )
 
-    def save(self, state: TrainState) -> None:
+    def save(self, state: Stepped) -> None:
         """Saves a state under its step number, atomically.
 
         Raises:
@@ -53,7 +64,7 @@ class Checkpoints:
             if later > step:
                 self._manager.delete(later)
 
-    def latest(self, like: TrainState) -> TrainState | None:
+    def latest(self, like: State) -> State | None:
         """The newest state, structured like ``like``; None if there is none.
 
         Raises:
@@ -80,7 +91,7 @@ class Checkpoints:
         self._manager.close()
 
 
-def _plain(state: TrainState) -> list[Any]:
+def _plain(state: Stepped) -> list[Any]:
     """The leaves in order; their structure comes from the config, not from disk."""
     return jax.tree.leaves(state)
 

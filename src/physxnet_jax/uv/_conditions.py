@@ -7,10 +7,10 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse.csgraph import dijkstra
 
 from ..body import NUM_BODY_VERTICES, Body
-from ..garment import Fabric, Garment
+from ..garment import Fabric, Garment, refine_garment
 from ..geometry import boundary_loops, mesh_edges
 from ._atlas import Atlas
-from ._bind import Binding
+from ._bind import Binding, bind
 from ._skirt import skirt_hull
 
 CONDITIONS = (
@@ -28,6 +28,9 @@ CONDITIONS = (
 # Units of the channels: about 1 for the loosest and widest clothes.
 _DISTANCE, _BORDER = 0.1, 0.2
 _WIDEST = 2.0
+# Networks learn from meshes of edges up to the first [m]. Coarser ones leave most texels without a
+# vertex; they are described by a mesh with edges up to the second.
+_COARSE, _FINE = 0.03, 0.02
 # The fabric of a garment that nothing is known about.
 _COTTON = Fabric()
 
@@ -40,6 +43,8 @@ def condition_maps(
     binding: Binding,
 ) -> Float[Array, "height width channels"]:
     """What a network sees of a garment, at the texels that it samples; zero elsewhere.
+
+    A coarse mesh is refined first, so that a garment looks the same however it is triangulated.
 
     Args:
         atlas: The atlas.
@@ -54,6 +59,11 @@ def condition_maps(
         the nearest border in units of 20 cm, at most 1; and the decimal logarithms of bending,
         stretch, density and friction over those of cotton.
     """
+    if _longest_edge(garment) > _COARSE:
+        garment = refine_garment(garment, _FINE)
+        binding = bind(
+            garment, atlas=atlas, body=body, rest=rest, valid=jnp.ones(atlas.num_texels, bool)
+        )
     vertices, faces = np.asarray(garment.mesh.vertices, np.float64), np.asarray(garment.mesh.faces)
     # A triangle that names a vertex twice has an edge that would pass for a border.
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
@@ -77,6 +87,12 @@ def condition_maps(
     seen = total > 1e-6
     means = np.where(seen[:, None], (sampling @ values) / np.maximum(total, 1e-6)[:, None], 0.0)
     return _closed(atlas.to_map(jnp.asarray(means.astype(np.float32))))
+
+
+def _longest_edge(garment: Garment) -> float:
+    x, edges = np.asarray(garment.mesh.vertices), mesh_edges(np.asarray(garment.mesh.faces))
+    a, b = edges.vertices.T
+    return float(np.linalg.norm(x[a] - x[b], axis=1).max())
 
 
 def _points_beneath(

@@ -16,7 +16,7 @@ from ...geometry import (
     Stencil,
     TriMesh,
     closest_among,
-    fast_argmin,
+    nearest_index,
     safe_normalize,
     spread_points,
     vertex_normals,
@@ -25,6 +25,8 @@ from ...typing import pytree
 
 # Skin points compared for each vertex, their spacing [m], and the triangles around each.
 _NUM_CHOICES, _SPACING, _NUM_TRIANGLES = 96, 0.03, 20
+# Triangles compared exactly: those with the nearest middles.
+_NUM_EXACT = 3
 # Minimum cosine between the outward direction and the normal of skin in front of a vertex.
 _MIN_COSINE = 0.25
 # Squared distance of a skin point from the line along the outward direction: contact is full
@@ -46,7 +48,7 @@ class SkirtCollider:
         order: Index of each vertex in ``lying`` followed by ``rows``, shape [vertices].
         outward: Unit direction out of the skirt at rest, shape [hanging, 3].
         weights: Skinning weights of the hanging vertices, shape [hanging, joints].
-        compared: Whether each is compared with each of ``middles``, shape [hanging, patches].
+        compared: Whether each of ``middles`` is compared with each, shape [patches, hanging].
         middles: Skin vertices at the middle of each patch, shape [patches].
         table: Triangles around each of them, shape [patches, k].
     """
@@ -56,7 +58,7 @@ class SkirtCollider:
     order: Int[Array, " vertices"]
     outward: Float[Array, "hanging 3"]
     weights: Float[Array, "hanging joints"]
-    compared: Bool[Array, "hanging patches"]
+    compared: Bool[Array, "patches hanging"]
     middles: Int[Array, " patches"]
     table: Int[Array, "patches k"]
 
@@ -117,7 +119,7 @@ def make_skirt_collider(
         jnp.asarray(np.argsort(np.concatenate([lying, rows])).astype(np.int32)),
         jnp.asarray(outward),
         worn.skin[jnp.asarray(rows)],
-        jnp.asarray(compared),
+        jnp.asarray(compared.T),
         jnp.asarray(chosen.astype(np.int32)),
         jnp.asarray(table.astype(np.int32)),
     )
@@ -170,20 +172,20 @@ def skirt_contacts(
     p, direction, m, n = jax.lax.stop_gradient(
         (points - origin, outward, skin[collider.middles] - origin, normals[collider.middles])
     )
-    along = dense(direction, m.T) - jnp.sum(p * direction, axis=1)[:, None]
-    facing = dense(direction, n.T)
-    squared = jnp.sum(p * p, axis=1)[:, None] + jnp.sum(m * m, axis=1)[None] - 2.0 * dense(p, m.T)
-    nearest = _masked_argmin(squared, collider.compared)
+    along = dense(m, direction.T) - jnp.sum(p * direction, axis=1)[None]
+    facing = dense(n, direction.T)
+    squared = jnp.sum(p * p, axis=1)[None] + jnp.sum(m * m, axis=1)[:, None] - 2.0 * dense(m, p.T)
+    nearest = _masked_nearest(squared, collider.compared)
     # Skin in front of the vertex, along the outward direction.
     in_front = (
         collider.compared & (facing > _MIN_COSINE) & (along > -_SPACING) & (along < _MAX_CARRY)
     )
-    pick = _masked_argmin(squared - along * along, in_front)
+    pick = _masked_nearest(squared - along * along, in_front)
     gap = skin[collider.middles[pick]] - points
     reach = jnp.sum(gap * outward, axis=1)
     # The root of the cost is the distance of that skin point from the outward line.
     cost = jnp.sum(gap * gap, axis=1) - reach * reach
-    cost = jnp.where(jnp.any(in_front, axis=1), cost, _NO_CONTACT)
+    cost = jnp.where(jnp.any(in_front, axis=0), cost, _NO_CONTACT)
     level = points + reach[:, None] * outward
     return SkirtContacts((points, level), (collider.table[nearest], collider.table[pick]), cost)
 
@@ -240,7 +242,7 @@ def closest_skin_point(
         points: Query points [m].
         candidates: Triangles compared for each point.
     """
-    hit = closest_among(TriMesh(skin, faces), points, candidates)
+    hit = closest_among(TriMesh(skin, faces), points, candidates, exactly=_NUM_EXACT)
     tri = faces[hit.face]
     closest = jnp.einsum("pk,pkx->px", hit.weights, skin[tri], precision=jax.lax.Precision.HIGHEST)
     return closest, safe_normalize(
@@ -248,7 +250,8 @@ def closest_skin_point(
     )
 
 
-def _masked_argmin(
-    cost: Float[Array, "hanging patches"], among: Bool[Array, "hanging patches"]
+def _masked_nearest(
+    squared: Float[Array, "patches hanging"], among: Bool[Array, "patches hanging"]
 ) -> Int[Array, " hanging"]:
-    return fast_argmin(jnp.where(among, cost, _EXCLUDED))
+    # Sums of products may lie a little below zero.
+    return nearest_index(jnp.where(among, jnp.maximum(squared, 0.0), _EXCLUDED))
