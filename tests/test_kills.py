@@ -125,7 +125,7 @@ def test_training_killed_five_times_has_the_same_weights(tmp_path):
     np.testing.assert_array_equal(weights(tmp_path / "killed"), weights(tmp_path / "plain"))
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_a_lost_training_process_ends_the_run_which_resumes(tmp_path):
     def both(steps):
         port = free_port()

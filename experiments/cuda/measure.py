@@ -380,7 +380,8 @@ def _train(name: str, table: str, record: Record, toy: bool, until: float) -> No
         config, model=dataclasses.replace(config.model, templates=templates)
     )
     if toy:
-        model = dataclasses.replace(config.model, resolution=32, width=4)
+        size = 64 if config.model.finer else 32
+        model = dataclasses.replace(config.model, resolution=size, width=4)
         config = dataclasses.replace(config, model=model, batch=4)
     began = time.perf_counter()
     trial = WORK / f"{name}-trial"
@@ -395,7 +396,9 @@ def _train(name: str, table: str, record: Record, toy: bool, until: float) -> No
     spent = time.perf_counter() - began
     laps = read_metrics(trial)
     step_s = (laps[-1]["seconds"] - laps[-2]["seconds"]) / (laps[-1]["step"] - laps[-2]["step"])
-    frames = sum(s.motion.num_frames for s in sequences if s.name not in config.validation)
+    used = [s for s in sequences if s.motion.name not in config.validation]
+    # A step takes a batch of each template.
+    frames = max(sum(s.motion.num_frames for s in used if t in s.offsets) for t in templates)
     frames *= 2 if config.mirror_augmentation else 1
     epoch = max(frames // config.batch, 1)
     record.add(

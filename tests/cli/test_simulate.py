@@ -318,7 +318,7 @@ def test_effects_command_prints_and_writes_its_table(tmp_path, capsys, monkeypat
     assert data[0]["jitter_mm"] == data[2]["jitter_mm"] > 0
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_recommended_scene_is_written_and_simulated(tmp_path, capsys):
     needed = tmp_path / "needed.toml"
     words = ["effects", "balance", "--wear", "bottom:fabric=silk", "--frames", "2"]
@@ -364,9 +364,9 @@ def test_rollout_fingerprint_is_equal_across_processes():
     code = (
         "from physxnet_jax.simulation import PRESETS, Scene, prepare_scene, XPBD\n"
         "from physxnet_jax.simulation._resume import fingerprint\n"
-        "from physxnet_jax.garment import template\n"
+        "from physxnet_jax.garment import square_sheet\n"
         "pad = [object() for _ in range({pad})]\n"
-        "scene = prepare_scene(Scene((template('bottom'),)))\n"
+        "scene = prepare_scene(Scene((square_sheet(12, 0.5),)))\n"
         "print(fingerprint(scene, (XPBD({steps}, 2), True)))\n"
     )
 

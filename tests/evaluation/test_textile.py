@@ -11,7 +11,7 @@ from physxnet_jax.garment import FABRICS
 EDGE = 0.011
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_drape_coefficients_are_in_their_published_ranges():
     drapes = {name: drape_test(fabric) for name, fabric in FABRICS.items()}
     for name, drape in drapes.items():

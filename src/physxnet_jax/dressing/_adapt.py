@@ -166,7 +166,7 @@ def adapt(
         Santesteban et al., SNUG (2022); Grigorev et al., HOOD (2023).
     """
     config = AdaptConfig() if config is None else config
-    tell = (lambda *_: None) if progress is None else progress
+    report = (lambda *_: None) if progress is None else progress
     began = time.perf_counter()
     body = load_body()
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
@@ -190,14 +190,14 @@ def adapt(
     if resume is not None:
         call = (predictor.state, scene.effects, scene.inverse_mass, clips, np.asarray(rest))
         folder = _claim(pathlib.Path(resume), fingerprint(*call), config, simulate)
-    truth = _simulated(scene, clips, solver, folder, tell) if simulate else None
+    truth = _simulated(scene, clips, solver, folder, report) if simulate else None
     simulated = time.perf_counter() - began
     system = make_system(scene, solver)
     task, first = _make_task(predictor, body, rest, worn, system, config, simulate)
     data = [_encode(task, first, m, body, rest) for m in clips]
     if truth is not None:
         data = [dataclasses.replace(d, target=x) for d, x in zip(data, truth, strict=True)]
-    best, steps = _learn(task, first, data[:-1], data[-1], folder, tell)
+    best, steps = _learn(task, first, data[:-1], data[-1], folder, report)
     if folder is not None:
         shutil.rmtree(folder)
     before, after = (_judge(task, p, data[-1]) for p in (first, best))
@@ -233,7 +233,7 @@ def _simulated(
     clips: list[Motion],
     solver: Solver,
     folder: pathlib.Path | None,
-    tell: Callable[[str, int, int], None],
+    report: Callable[[str, int, int], None],
 ) -> list[Float[np.ndarray, "frames vertices 3"]]:
     """The garment as it is simulated on each clip [m]."""
     stored = None if folder is None else folder / "simulations.npz"
@@ -244,7 +244,7 @@ def _simulated(
         scene,
         clips,
         solver=solver,
-        progress=lambda k, n: tell("simulation", k, n),
+        progress=lambda k, n: report("simulation", k, n),
         resume=None if folder is None else folder / "simulation",
     )
     for r in rollouts:
@@ -503,7 +503,7 @@ def _learn(
     clips: list[_Frames],
     held_out: _Frames,
     folder: pathlib.Path | None,
-    tell: Callable[[str, int, int], None],
+    report: Callable[[str, int, int], None],
 ) -> tuple[Any, int]:
     """The parameters that did best on the held-out clip, and the steps they took."""
     config = task.config
@@ -542,7 +542,7 @@ def _learn(
                 now = dataclasses.replace(now, best=params, least=loss, best_step=now.step)
             if checkpoints is not None:
                 checkpoints.save(now)
-        tell("steps", step, config.steps)
+        report("steps", step, config.steps)
     if checkpoints is not None:
         checkpoints.close()
     return now.best, int(now.best_step)
