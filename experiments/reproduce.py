@@ -41,9 +41,9 @@ WEIGHTS = ROOT / "src/physxnet_jax/models/weights"
 # Rows of clothes with ease, and of the fitted garments that the paper's network learned from.
 CLOTHES, FITTED = RESULTS / "test_errors.json", RESULTS / "fitted_errors.json"
 METHODS = {
-    CLOTHES: (*("lbs", "base+relax+push", "base+guided", "perturbed"),),
+    CLOTHES: (*("lbs", "nano+relax+push", "base+relax+push", "base+guided", "perturbed"),),
     FITTED: (
-        *("lbs", "nearest", "mlp", "nano", "nano+relax+push", "small", "small+relax+push"),
+        *("lbs", "nearest", "mlp", "small", "small+relax+push"),
         *("paper", "paper+push", "draft", "perturbed"),
     ),
 }
@@ -57,7 +57,7 @@ SHORT = {
 # Profiles that `--budget-ms` and `--max-error-mm` choose from. `standard` is as far from itself as
 # two of its runs part.
 LADDER = {
-    **{m: m for m in ("lbs", "base+relax+push", "base+guided")},
+    **{m: m for m in ("lbs", "nano+relax+push", "base+relax+push", "base+guided")},
     "perturbed": "standard",
 }
 # Whose squared errors are shown action by action.
@@ -67,7 +67,7 @@ EACH = {
 }
 NETWORKS = {CLOTHES: ("base+relax+push", "base+guided"), FITTED: ("paper", "paper-blender")}
 # Rows of fitted_errors.md that the page leaves out.
-LEFT_OUT = ("nano", "small", "paper+push", "blender-22+push")
+LEFT_OUT = ("small", "paper+push", "blender-22+push")
 # The paper's order.
 ACTIONS = (
     *("jump", "walking", "moon walk", "chinese dance", "punch", "balancing", "ballet"),

@@ -144,6 +144,8 @@ _PACKAGES = {
 _HOME = {name: package for package, names in _PACKAGES.items() for name in names}
 
 __all__ = [
+    "AdaptConfig",
+    "Adapted",
     "Body",
     "Character",
     "Clothed",
@@ -158,6 +160,7 @@ __all__ = [
     "Scene",
     "Simulation",
     "__version__",
+    "adapt",
     "bind",
     "bind_garment",
     "body_maps",

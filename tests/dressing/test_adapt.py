@@ -9,7 +9,7 @@ from flax import nnx
 
 from physxnet_jax.dressing import AdaptConfig, Inference, adapt, make_dresser
 from physxnet_jax.errors import MotionError, PhysXNetError, WeightsError
-from physxnet_jax.models import load_predictor
+from physxnet_jax.models import fold_batch_norm, load_predictor
 
 CONFIG = AdaptConfig(steps=4, windows=1, frames=3, learning_rate=3e-4, validate_every=2)
 SHORT = {"weights": "nano", "frames": 6, "config": CONFIG}
@@ -98,6 +98,8 @@ def test_what_cannot_be_adapted_is_refused():
     nano = load_predictor("nano")
     with pytest.raises(WeightsError, match="as it was loaded"):
         adapt("bottom", weights=dataclasses.replace(nano, mirror_tta=True))
+    with pytest.raises(WeightsError, match="as it was loaded"):
+        adapt("bottom", weights=fold_batch_norm(nano))
     custom = nnx.Linear(2, 2, rngs=nnx.Rngs(0))
     graph, state = nnx.split(custom)
     with pytest.raises(WeightsError, match="as it was loaded"):

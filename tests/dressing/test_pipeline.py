@@ -45,9 +45,13 @@ def test_sixty_frames_a_second_are_every_other_of_thirty():
     slow, fast = (load_motion("punch", fps=fps) for fps in (30.0, 60.0))
     dresser = make_dresser(["bottom"], inference=PLAIN)
     assert dresser.history_length(60.0) == 2 * dresser.history_length(30.0)
-    a = clothe(dresser, slow.rotations[:12], slow.root[:12], 30.0)["bottom"]
-    b = clothe(dresser, fast.rotations[:23], fast.root[:23], 60.0)["bottom"]
-    np.testing.assert_allclose(b[::2][5:], a[5:], atol=2e-4)
+    # From the first frame on whose window begins within the clip.
+    first = dresser.history_length(30.0)
+    count = first + 6
+    a = clothe(dresser, slow.rotations[:count], slow.root[:count], 30.0)["bottom"]
+    count = 2 * count - 1
+    b = clothe(dresser, fast.rotations[:count], fast.root[:count], 60.0)["bottom"]
+    np.testing.assert_allclose(b[::2][first:], a[first:], atol=2e-4)
     stream = init_stream(dresser, fast.rotations[0], fast.root[0])
     with pytest.raises(ValueError, match="pass fps to init_stream"):
         clothe_step(dresser, stream, fast.rotations[0], fast.root[0], 60.0)

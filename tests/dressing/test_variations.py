@@ -58,14 +58,19 @@ def test_only_simulated_cloth_has_a_fabric(guided):
 
 
 @pytest.mark.release
-def test_guided_cloth_of_another_shape_is_near_that_of_a_new_dresser(guided, motion):
+def test_guided_cloth_of_another_shape_is_near_that_of_a_new_dresser(motion):
     """And far from that of the shape before."""
+    # Patches are chosen anew on another shape, which shows where a network moves cloth far.
+    near = Inference(weights="small")
+    guided = make_dresser(
+        ["shorts"], method="guided", inference=near, simulation=Simulation(substeps=4)
+    )
     shape = guided.body.shape(weight_up=0.6, height_up=0.5)
     # Not cut for that person: the same garment, moved to the shape.
     anew = make_dresser(
         [tailor("shorts")],
         method="guided",
-        inference=NANO,
+        inference=near,
         simulation=Simulation(substeps=4),
         shape=shape,
     )
@@ -115,7 +120,7 @@ def test_gradients_by_pose_shape_cut_and_fabric_match_differences(guided, motion
             return jnp.sum(clothe(other, turned, p, 30.0)["shorts"][-1] * weight)
 
         found = np.asarray(jax.jit(jax.grad(loss))(jnp.zeros(5)))
-        for k, step in enumerate((1e-6, 1e-5, 1e-6, 1e-4, 1e-4)):
+        for k, step in enumerate((1e-6, 1e-5, 1e-6, 1e-5, 1e-5)):
             ahead, back = (float(loss(jnp.zeros(5).at[k].set(s))) for s in (step, -step))
             assert found[k] == pytest.approx((ahead - back) / (2 * step), rel=1e-3), k
             assert found[k] != 0.0

@@ -28,12 +28,14 @@ def test_mirror_suffix_makes_predictions_mirror_symmetric():
     twin = mirrored(load_body(), walk)
     skinned = [method_by_name("lbs")(m, "top").positions for m in (walk, twin)]
     away = {}
-    for name in ("nano", "nano+mirror"):
+    for name in ("small", "small+mirror", "nano", "nano+mirror"):
         method = method_by_name(name)
         one, two = (method(m, "top").positions - s for m, s in zip((walk, twin), skinned))
         away[name] = np.linalg.norm(one - mirrored_offsets(template("top"), two), axis=-1).mean()
-    # What is left is sampling: the meshes of both halves aren't the same.
-    assert away["nano+mirror"] < 0.3e-3 < 2e-3 < away["nano"]
+    # What is left is sampling: the meshes of both halves aren't the same, and finer maps hold more
+    # that differs from texel to texel.
+    assert away["small+mirror"] < 0.3e-3 < 2e-3 < away["small"]
+    assert away["nano+mirror"] < 1e-3 < 5e-3 < away["nano"]
 
 
 def test_external_engines_are_methods_like_any_other(monkeypatch):
@@ -66,12 +68,16 @@ def test_strain_limiting_suffix_reduces_strain_with_small_displacements(name):
     punch = load_motion("punch", fps=30.0)
     punch = Motion(punch.rotations[40:48], punch.root[40:48], punch.fps, punch.name)
     assembly = prepare_scene(Scene((template(name),))).assembly
-    answers = {n: method_by_name(n)(punch, name).positions for n in ("nano", "nano+relax")}
-    before, after = (np.abs(edge_strain(assembly, x)) for x in answers.values())
+    answers = {
+        n: method_by_name(n)(punch, name).positions
+        for n in ("nano", "nano+relax", "small", "small+relax")
+    }
+    before, after = (np.abs(edge_strain(assembly, answers[n])) for n in ("nano", "nano+relax"))
     # What is far from its length, the more so.
     for share, most in ((0.5, 0.7), (0.9, 0.6), (0.99, 0.6)):
         assert np.quantile(after, share) < most * np.quantile(before, share)
-    moved = np.linalg.norm(np.subtract(*answers.values()), axis=2)
+    # A network that learned this garment has little to be moved.
+    moved = np.linalg.norm(answers["small"] - answers["small+relax"], axis=2)
     assert 0.5e-3 < moved.mean() < 6e-3 and moved.max() < 0.06
 
 

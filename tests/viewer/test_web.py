@@ -189,10 +189,10 @@ def test_comparison_reports_distances_to_the_simulation():
 
 @pytest.mark.release
 def test_maps_display_velocity_and_acceleration():
-    shown = run_job(Choice("punch", ("top",), inference=Inference(weights="nano"), frames=20))
+    shown = run_job(Choice("punch", ("top",), inference=Inference(weights="small"), frames=20))
     maps = shown.maps(10)
     assert {"velocity", "acceleration", "top"} == set(maps)
-    still = run_job(Choice("balance", (), inference=Inference(weights="nano"), frames=1)).maps(0)
+    still = run_job(Choice("balance", (), inference=Inference(weights="small"), frames=1)).maps(0)
     grey = [np.abs(m["velocity"].astype(int) - 127).max() for m in (maps, still)]
     covered = (still["velocity"] != 255).any(axis=2)
     assert grey[0] > 100 and np.abs(still["velocity"][covered].astype(int) - 127).max() <= 1

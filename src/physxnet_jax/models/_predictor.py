@@ -155,9 +155,15 @@ class Predictor:
     def modulation(
         self, template: str, conditions: Float[Array, "height width channels"]
     ) -> Modulation:
-        """What the maps of a garment change in its decoder, see `condition_maps`."""
+        """What the maps of a garment change in its decoder, see `condition_maps`.
+
+        With test-time augmentation a batch of two: of the garment and of its mirror image.
+        """
         network = nnx.merge(self.graph, self.state)
-        return network.modulation(template, conditions[None].astype(self._dtype))
+        maps = conditions[None].astype(self._dtype)
+        if self.mirror_tta:
+            maps = jnp.concatenate([maps, maps[:, :, ::-1]])
+        return network.modulation(template, maps)
 
     def __call__(
         self,
@@ -206,16 +212,10 @@ class Predictor:
         network = nnx.merge(self.graph, self.state)
         network.eval()
         maps = self.motion_atlas.to_map(features).astype(self._dtype)
-        if modulation is None:
-            if self.mirror_tta:
-                maps = jnp.concatenate([maps, _mirror_maps(maps)])
-            out = network(maps, tuple(templates))
-        else:
-            out = network(maps, tuple(templates), modulation)
-            if self.mirror_tta:
-                flipped = jax.tree.map(lambda m: m[:, :, ::-1], modulation)
-                twin = network(_mirror_maps(maps), tuple(templates), flipped)
-                out = {t: jnp.concatenate([m, twin[t]]) for t, m in out.items()}
+        if self.mirror_tta:
+            maps = jnp.concatenate([maps, _mirror_maps(maps)])
+            modulation = jax.tree.map(lambda m: jnp.repeat(m, len(maps) // 2, axis=0), modulation)
+        out = network(maps, tuple(templates), modulation)
         return {
             t: jnp.where(
                 self.texel_points.valid[t][None, :, None],
