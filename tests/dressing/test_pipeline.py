@@ -113,6 +113,7 @@ def test_clip_matches_clothe(motion):
     np.testing.assert_allclose(block.positions["bottom"], layer, atol=1e-6)
 
 
+@pytest.mark.release
 def test_test_time_augmentation_is_an_option(motion):
     plain = make_dresser(["bottom"], inference=PLAIN)
     both = make_dresser(["bottom"], inference=dataclasses.replace(PLAIN, tta=True))

@@ -29,6 +29,7 @@ def guided():
     )
 
 
+@pytest.mark.release
 def test_a_cut_replaces_the_rest_shape_of_its_garment():
     dresser = make_dresser(["shorts", "tee"], inference=NANO)
     wide = cut_vertices("shorts", {"ease": 0.2})

@@ -110,7 +110,7 @@ def test_one_frame_clip_is_treated_as_static(dresser, motion):
 @pytest.mark.parametrize(
     "weights",
     [
-        "nano",
+        pytest.param("nano", marks=pytest.mark.nightly),
         pytest.param("small", marks=pytest.mark.nightly),
         pytest.param("base", marks=pytest.mark.release),
         pytest.param("base+mirror", marks=pytest.mark.nightly),

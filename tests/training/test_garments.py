@@ -67,6 +67,7 @@ def test_garments_and_persons_are_numbered_once():
     assert len(w.rests()) == 2
 
 
+@pytest.mark.release
 def test_tables_sample_as_bindings_do():
     wardrobe = make_wardrobe([TIGHT, LOOSE], ("top",))
     atlas, motion_atlas, points, persons, tables = prepare_garments(MODEL, wardrobe)

@@ -68,6 +68,7 @@ def test_cotton_is_zero_and_other_fabrics_are_not(seen):
         np.testing.assert_allclose(silk[same], plain[same], atol=1e-6)
 
 
+@pytest.mark.release
 def test_a_coarse_mesh_is_seen_as_a_fine_one(seen):
     coarse = template("bottom")
     fine = seen(refine_garment(coarse, 0.015))
@@ -78,6 +79,7 @@ def test_a_coarse_mesh_is_seen_as_a_fine_one(seen):
         assert np.abs(fine[name] - found[name])[both].mean() < 0.03, name
 
 
+@pytest.mark.release
 def test_garments_without_borders_and_of_templates_are_described(seen):
     for name in ("top", "bottom", "dress"):
         assert seen(template(name))["covered"].sum() > 300

@@ -215,7 +215,9 @@ class Predictor:
         if self.mirror_tta:
             maps = jnp.concatenate([maps, _mirror_maps(maps)])
             modulation = jax.tree.map(lambda m: jnp.repeat(m, len(maps) // 2, axis=0), modulation)
-        out = network(maps, tuple(templates), modulation)
+        # A custom network may take no garments.
+        known = () if modulation is None else (modulation,)
+        out = network(maps, tuple(templates), *known)
         return {
             t: jnp.where(
                 self.texel_points.valid[t][None, :, None],
