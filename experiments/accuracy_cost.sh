@@ -4,4 +4,4 @@
 # on where it was stopped: remove the result first to measure all of it in one sitting.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-physxnet bench net --weights base base+guided paper --garments 1 3 --batches 1 --simulator perturbed --errors experiments/results/test_errors.json --data runs/clothes/default --out experiments/results/accuracy_cost.json
+physxnet bench net --weights nano base base+guided paper --garments 1 3 --batches 1 --simulator perturbed --errors experiments/results/test_errors.json --data runs/clothes/default --out experiments/results/accuracy_cost.json
