@@ -4,7 +4,7 @@ Command: python experiments/adapt.py
          --files FOLDER (default: garments in $PHYSXNET_DATA or ../shared)
          --weights base (default)
          --names tee pants ... (default: three of them)
-Cost:    ten minutes a garment on two cores; goes on where it was stopped.
+Cost:    7 to 40 minutes a garment on two cores, beside other work; goes on where it was stopped.
 Result:  experiments/results/adapt.json and .md: on two test actions that no network learned from,
          RMSE to a simulation of that very garment at `standard`, for the network before and after,
          and for guided simulation; and the time of learning.

@@ -1,6 +1,7 @@
 """Dressing: from motion and garments to animated meshes."""
 
-from ._adapt import AdaptConfig as AdaptConfig, Adapted as Adapted, adapt as adapt
+from ._adapt import Adapted as Adapted, adapt as adapt
+from ._adapt_task import AdaptConfig as AdaptConfig
 from ._blocks import infer_clip as infer_clip, pose_clip as pose_clip
 from ._character import (
     Character as Character,
