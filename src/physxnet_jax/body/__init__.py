@@ -1,6 +1,7 @@
 """The human body: shape, pose and skin, independent of motion files."""
 
 from ._align import (
+    align_bones as align_bones,
     align_global as align_global,
     bone_directions as bone_directions,
     smallest_rotation as smallest_rotation,

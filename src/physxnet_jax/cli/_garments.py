@@ -12,7 +12,7 @@ from rich.table import Table
 from ..body import load_body
 from ..dressing import Inspection, fit_garment, inspect_garment
 from ..errors import MeshError
-from ..garment import template
+from ..garment import Opening, template
 from ..io import GltfFile, write_obj
 from ..motion import CLIPS, MotionInspection, inspect_motion
 from ._commands import ExportRest, Fit, Inspect
@@ -155,10 +155,20 @@ def _garment_rows(found: Inspection) -> list[tuple[str, str]]:
             ("template", found.template or "-"),
             ("distance from", ", ".join(f"{t} {1e3 * d:.0f} mm" for t, d in found.apart.items())),
             ("rays that hit the body", f"{100 * found.hit_rate:.1f} %"),
+            ("limbs", "; ".join(_opening(o) for o in found.openings[:8]) or "no opening"),
+            ("covers", f"{100 * found.covered:.0f} % of the skin"),
+            ("skin shows through", f"{100 * found.visible_skin:.2f} %"),
         ]
     return rows
 
 
+def _opening(opening: Opening) -> str:
+    """An opening and the limbs that pass through it."""
+    return f"{' + '.join(opening.limbs) or 'none'} ({opening.around:.2f} m around)"
+
+
 def _to_json(found: Inspection | MotionInspection) -> dict[str, Any]:
     values = dataclasses.asdict(found) | {"path": str(found.path), "verdict": found.verdict}
+    if isinstance(found, Inspection):
+        values["openings"] = [{"around": o.around, "limbs": o.limbs} for o in found.openings]
     return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}

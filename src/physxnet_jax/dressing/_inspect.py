@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import pathlib
 import shlex
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,22 +20,28 @@ from ..garment import (
     TEMPLATES,
     Garment,
     MeshHealth,
+    Opening,
     Template,
     align_to_template,
     clearance,
+    garment_of,
     guess_template,
     hangs_off,
-    load_garment,
     locate_on_body,
     mesh_health,
+    parse_wear,
+    place_file,
     template,
 )
-from ..geometry import TriMesh, make_mesh
+from ..geometry import TriMesh, make_mesh, vertex_normals, visible_skin
 from ..io import StaticMesh, mesh_name, read_mesh
 from ..uv import bind, garment_map_rows, make_atlas
 
 # Share of vertices inside [1], median edge [m] and share of missing rays [1] worth reporting.
 _INSIDE, _FINE, _MAX_MISSED = 0.02, 0.003, 0.1
+# Cloth is over skin up to this distance, and this much aside of the normal [m]; share of the skin
+# that something worn covers, and share of visible skin worth reporting [1]; size of the pictures.
+_OVER, _ASIDE, _BARE, _SHOWS, _PIXELS = 0.15, 0.02, 0.005, 0.01, 256
 # Smallest extent of a garment [m], and largest number of meshes of a file to examine.
 _MIN_EXTENT, _MAX_PARTS = 0.25, 20
 # A better placement has to bring a garment nearer to the skin by this factor; below this hit
@@ -63,6 +70,10 @@ class Inspection:
         apart: Distance from each template on the body [m]: the mean distance from vertices of
             one mesh to the nearest of the other, the larger of both directions.
         hit_rate: Share of vertices whose ray meets the body.
+        openings: Openings and the limbs that pass through them, longest first.
+        covered: Share of the skin that it covers.
+        visible_skin: Share of a dressed person at rest that shows skin which came through, see
+            `geometry.visible_skin`.
         problems: Problems, a sentence each.
         notes: Remarks that need no action.
         command: The command that repairs it, or lists the garments of a file with several; None
@@ -84,6 +95,9 @@ class Inspection:
     template: Template | None
     apart: dict[Template, float]
     hit_rate: float
+    openings: tuple[Opening, ...]
+    covered: float
+    visible_skin: float
     problems: tuple[str, ...]
     notes: tuple[str, ...]
     command: str | None
@@ -93,7 +107,12 @@ class Inspection:
     def verdict(self) -> str:
         """``ready``, or the next step."""
         if not self.problems:
-            return "ready: it can be worn as it is."
+            limbs = sorted({limb for o in self.openings for limb in o.limbs})
+            through = f"{', '.join(limbs)} pass through its openings and " if limbs else ""
+            return (
+                f"ready: it can be worn as it is; {through}it covers"
+                f" {100 * self.covered:.0f} % of the skin."
+            )
         return f"{'inspect each' if self.several else 'repair it first'}: {self.command}"
 
 
@@ -110,14 +129,16 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     Raises:
         FormatError: The file can't be read.
     """
-    path = pathlib.Path(path)
+    item = parse_wear(path)
+    path = pathlib.Path(item.name)
     body = load_body() if body is None else body
     raw = read_mesh(path)
     skin = body.rest_mesh()
     try:
-        v, unit, up, posed = locate_on_body(path, raw.vertices, body, raw.faces)
+        raw, placement = place_file(item, body)
     except MeshError as error:
-        return _misplaced(path, raw, skin, str(error).partition(": ")[2])
+        return _misplaced(path, raw, body, str(error).partition(": ")[2])
+    v = placement.vertices
     mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
     health = mesh_health(mesh)
     distance, _ = clearance(skin, np.asarray(v, np.float32))
@@ -127,18 +148,21 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     _, away = clearance(skin, corner.mean(axis=1).astype(np.float32))
     outward = float(np.mean(np.einsum("fi,fi->f", normal, away) > 0))
-    garment, _ = load_garment(path, body=body)
+    garment, _ = garment_of(path, raw, placement, item.template, body)
     hit_rate = _hit_rate(body, garment)
     found = _Findings([], [], [])
     _report_mesh(found, health, outward)
-    _report_placement(found, raw, distance, inside, hit_rate, skin)
+    _report_placement(found, raw, distance, inside, hit_rate, body)
     _report_size(found, health, hangs)
     outfit = _report_parts(found, path, raw, body)
     _report_images(found, raw)
-    if posed:
-        found.notes.append(
-            "modelled in a T-pose; worn as it is, its sleeves are turned down with the arms."
-        )
+    found.notes.extend(placement.notes)
+    covered = covered_share(garment, skin)
+    worn = np.asarray(garment.mesh.vertices), np.asarray(garment.mesh.faces)
+    seen = visible_skin(
+        np.asarray(skin.vertices), np.asarray(skin.faces), [worn], pixels=_PIXELS
+    ).share
+    _report_worn(found, placement.openings, covered, seen)
     if health.components > 1:
         found.notes.append(f"{health.components} disconnected parts: each moves independently.")
     if hit_rate < 1 - _MAX_MISSED:
@@ -148,8 +172,8 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         )
     return Inspection(
         path=path,
-        unit=unit,
-        up=up,
+        unit=placement.unit,
+        up=placement.up,
         size=_size(raw),
         health=health,
         polygons=raw.count,
@@ -161,6 +185,9 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         template=garment.template,
         apart=_template_distances(v),
         hit_rate=hit_rate,
+        openings=placement.openings,
+        covered=covered,
+        visible_skin=seen,
         problems=tuple(found.problems),
         notes=tuple(found.notes),
         command=outfit or (_command(path, found.options) if found.problems else None),
@@ -180,10 +207,10 @@ def _size(raw: StaticMesh) -> tuple[float, ...]:
     return tuple(float(s) for s in np.ptp(raw.vertices, axis=0))
 
 
-def _misplaced(path: pathlib.Path, raw: StaticMesh, skin: TriMesh, problem: str) -> Inspection:
+def _misplaced(path: pathlib.Path, raw: StaticMesh, body: Body, problem: str) -> Inspection:
     """The inspection of a mesh that no unit and up axis places on the body."""
     # Suggests the template whose place it fits best; the user may choose another.
-    nearest = min(TEMPLATES, key=lambda t: align_to_template(raw.vertices, template(t), skin)[2])
+    nearest = min(TEMPLATES, key=lambda t: align_to_template(raw, template(t), body)[2])
     health = mesh_health(make_mesh(raw.vertices, raw.faces, raw.uv, raw.uv_faces))
     nan = float("nan")
     return Inspection(
@@ -201,6 +228,9 @@ def _misplaced(path: pathlib.Path, raw: StaticMesh, skin: TriMesh, problem: str)
         template=None,
         apart={},
         hit_rate=nan,
+        openings=(),
+        covered=nan,
+        visible_skin=nan,
         problems=(problem,),
         notes=(),
         command=_command(path, [f"--like {nearest}"]),
@@ -233,18 +263,50 @@ def _report_placement(
     distance: np.ndarray,
     inside: float,
     hit_rate: float,
-    skin: TriMesh,
+    body: Body,
 ) -> None:
     if inside > _INSIDE:
         found.problems.append(f"{100 * inside:.1f} % of its vertices lie in the body or on it.")
     loose = hit_rate < _MIN_HIT_RATE and float(np.median(np.abs(distance))) > LONG
     if inside > ELSEWHERE or loose:
         # It may be reversed or misplaced: lifting it out of the body would ruin it.
-        better = _better_placement(raw.vertices, distance, skin)
+        better = _better_placement(raw, distance, body)
         if better is not None:
             name, description = better
             found.problems.append(f"it lies or faces elsewhere than a {name}: {description}")
             found.options.append(f"--like {name}")
+
+
+def covered_share(garment: Garment, skin: TriMesh) -> float:
+    """Share of the skin's area that cloth lies over, at most `_OVER` away."""
+    faces = np.asarray(skin.faces)
+    points, normals = np.asarray(skin.vertices), vertex_normals(skin.vertices, skin.faces)
+    tree = KDTree(np.asarray(garment.mesh.vertices))
+    distance, nearest = tree.query(points)
+    height = np.einsum("vc,vc->v", tree.data[nearest] - points, np.asarray(normals))
+    lateral = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
+    over = (height > 0.0) & (distance < _OVER) & (lateral < _ASIDE + 0.7 * height)
+    corner = points[faces]
+    area = np.linalg.norm(
+        np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1
+    )
+    return float(np.sum(area * over[faces].mean(axis=1)) / area.sum())
+
+
+def _report_worn(
+    found: _Findings, openings: Sequence[Opening], covered: float, seen: float
+) -> None:
+    """Reports openings that no limb passes through, and skin that comes through."""
+    if covered < _BARE:
+        found.problems.append(f"it covers {100 * covered:.1f} % of the skin: it isn't worn.")
+    if seen > _SHOWS:
+        found.problems.append(f"{100 * seen:.1f} % of what is seen of it is skin: cloth is inside.")
+    empty = [o for o in openings if not o.limbs]
+    if empty and len(empty) < len(openings):
+        around = ", ".join(f"{o.around:.2f}" for o in empty)
+        found.notes.append(f"no limb passes through openings of {around} m around.")
+    elif empty and len(openings) > 1:
+        found.problems.append("no limb passes through any of its openings: it isn't worn.")
 
 
 def _report_size(found: _Findings, health: MeshHealth, hangs: float) -> None:
@@ -303,20 +365,20 @@ def _kinds(path: pathlib.Path, parts: tuple[str, ...], body: Body) -> dict[str, 
     for name in parts[:_MAX_PARTS]:
         mesh = read_mesh(f"{path}#{name}")
         with contextlib.suppress(MeshError):
-            v, *_ = locate_on_body(path, mesh.vertices, body, mesh.faces)
+            v = locate_on_body(path, mesh, body).vertices
             if np.ptp(v, axis=0).max() > _MIN_EXTENT:
                 found[name] = guess_template(v, mesh.faces)
     return found
 
 
 def _better_placement(
-    vertices: np.ndarray, distance: np.ndarray, skin: TriMesh
+    raw: StaticMesh, distance: np.ndarray, body: Body
 ) -> tuple[Template, str] | None:
     """A template whose place a garment fits better than its own, and how; None if there is none."""
-    placements = {name: align_to_template(vertices, template(name), skin) for name in TEMPLATES}
+    placements = {name: align_to_template(raw, template(name), body) for name in TEMPLATES}
     name: Template = min(TEMPLATES, key=lambda n: placements[n][2])
     placed, description, _ = placements[name]
-    there, _ = clearance(skin, np.asarray(placed, np.float32))
+    there, _ = clearance(body.rest_mesh(), np.asarray(placed.vertices, np.float32))
     now, then = (float(np.mean(x < NEAREST)) for x in (distance, there))
     nearer = float(np.mean(np.abs(there))) < _DISTANCE_RATIO * float(np.mean(np.abs(distance)))
     better = then <= max(0.7 * now, _INSIDE) if nearer else then <= 0.25 * now and now > ELSEWHERE

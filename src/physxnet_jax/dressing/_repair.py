@@ -11,6 +11,7 @@ from ..body import Body, load_body
 from ..errors import MeshError
 from ..garment import (
     NEAREST,
+    Hints,
     Template,
     align_to_template,
     carried,
@@ -21,6 +22,7 @@ from ..garment import (
     locate_on_body,
     mesh_health,
     orient,
+    parse_wear,
     polygons_left,
     subdivide,
     template,
@@ -69,7 +71,8 @@ def fit_garment(
             is the file itself, or the garment falls off the body.
         MissingDependencyError: fast-simplification isn't installed, and is needed to decimate.
     """
-    path, out = pathlib.Path(path), pathlib.Path(out)
+    item, out = parse_wear(path), pathlib.Path(out)
+    path = pathlib.Path(item.name)
     if out.suffix.lower() != ".obj":
         raise MeshError(f"{out}: garments are written as .obj.")
     if out.resolve() == path.resolve():
@@ -77,15 +80,16 @@ def fit_garment(
     body = load_body() if body is None else body
     raw = read_mesh(path)
     skin = body.rest_mesh()
-    done = []
+    hints = Hints(unit=item.unit, up=item.up, front=item.front)
+    done: list[str] = []
     if like is None:
-        v, unit, up, posed = locate_on_body(path, raw.vertices, body, raw.faces)
-        done.append(f"read as {unit}, {up} up.")
-        if posed:
-            done.append("moved from its T-pose to the body's rest pose.")
+        placement = locate_on_body(path, raw, body, hints)
+        done.append(f"read as {placement.unit}, {placement.up} up.")
     else:
-        v, description, _ = align_to_template(raw.vertices, template(like), skin)
+        placement, description, _ = align_to_template(raw, template(like), body, hints)
         done.append(description)
+    done += placement.notes
+    v = placement.vertices
     mesh = make_mesh(v, raw.faces, raw.uv, raw.uv_faces)
     before = mesh_health(mesh)
     if before.coincident_vertices:

@@ -17,11 +17,18 @@ from ._load import (
     LONG as LONG,
     NEAREST as NEAREST,
     carried as carried,
+    garment_of as garment_of,
     guess_template as guess_template,
     hangs_off as hangs_off,
     load_garment as load_garment,
+    place_file as place_file,
 )
-from ._locate import locate_on_body as locate_on_body
+from ._locate import (
+    Hints as Hints,
+    Placement as Placement,
+    locate_on_body as locate_on_body,
+)
+from ._openings import Opening as Opening
 from ._refine import refine_garment as refine_garment
 from ._repair import (
     MeshHealth as MeshHealth,
@@ -48,6 +55,7 @@ from ._templates import (
     template as template,
 )
 from ._wear import (
+    WearItem as WearItem,
     parse_wear as parse_wear,
     with_default_fabric as with_default_fabric,
     with_fabric as with_fabric,

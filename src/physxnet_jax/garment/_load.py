@@ -20,10 +20,11 @@ from ..geometry import (
     manifold_report,
     mesh_edges,
 )
-from ..io import GARMENT_FORMATS, mesh_name, read_mesh, split_part
+from ..io import GARMENT_FORMATS, StaticMesh, mesh_name, read_mesh, split_part
 from ._fit import clearance, lift_out
 from ._garment import COTTON, TEMPLATES, Garment, Template
-from ._locate import locate_on_body, nearest_skin
+from ._locate import Hints, Placement, locate_on_body, nearest_skin
+from ._openings import Opening
 from ._templates import template
 from ._wear import WearItem, parse_wear, with_fabric
 from .tailoring import KINDS, tailor
@@ -59,7 +60,10 @@ class GarmentReport:
         template: Template that dresses it.
         hangs: Smallest distance of its highest tenth from the skin [m].
         longest_edge: Length of its longest edge [m].
-        posed: Whether it was modelled in a T-pose and moved to the rest pose.
+        pose: Pose of the body that it was modelled on, ``rest`` or a description; it was moved to
+            the rest pose.
+        placed: How it was placed beyond reading unit and up axis, a sentence each.
+        openings: Its openings and the limbs that pass through them.
     """
 
     path: str
@@ -73,7 +77,9 @@ class GarmentReport:
     template: str
     hangs: float
     longest_edge: float
-    posed: bool = False
+    pose: str = "rest"
+    placed: tuple[str, ...] = ()
+    openings: tuple[Opening, ...] = ()
 
     @property
     def warning(self) -> str | None:
@@ -121,7 +127,7 @@ def load_garment(
     item = parse_wear(path)
     if item.name in KINDS:
         return _tailored(item, shape)
-    garment, report = _load(item.name, item.template, body)
+    garment, report = _load(item, body)
     return garment if item.fabric is None else with_fabric(garment, item.fabric), report
 
 
@@ -136,9 +142,27 @@ def _tailored(
     return garment, _report(item.name, "m", "Y", v, faces, inside, distance, garment.template)
 
 
-def _load(
-    path: str | pathlib.Path, kind: Template | None, body: Body
-) -> tuple[Garment, GarmentReport]:
+def place_file(item: WearItem, body: Body) -> tuple[StaticMesh, Placement]:
+    """Reads a garment file and places it on the body.
+
+    Raises:
+        MeshError: The file isn't a mesh, or nothing places it on the body.
+        FormatError: The file can't be read.
+    """
+    path = pathlib.Path(item.name)
+    if split_part(path)[0].suffix.lower() not in GARMENT_FORMATS:
+        raise MeshError(
+            f"{path}: a garment is one of {', '.join((*KINDS, *TEMPLATES))} or a file of triangles"
+            f" or quads: {', '.join(GARMENT_FORMATS)} (':as=top' after its name dresses it like a"
+            " template)."
+        )
+    raw = read_mesh(path)
+    hints = Hints(unit=item.unit, up=item.up, front=item.front)
+    return raw, locate_on_body(path, raw, body, hints)
+
+
+def _load(item: WearItem, body: Body) -> tuple[Garment, GarmentReport]:
+    path, kind = item.name, item.template
     if str(path) in TEMPLATES:
         if kind is not None:
             raise PhysXNetError(f"{path} is a template: leave 'as' out.")
@@ -149,16 +173,20 @@ def _load(
         near = distance < NEAREST
         report = _report(str(path), "m", "Y", v, faces, near, distance, g.template)
         return g, report
-    path = pathlib.Path(path)
-    if split_part(path)[0].suffix.lower() not in GARMENT_FORMATS:
-        raise MeshError(
-            f"{path}: a garment is one of {', '.join((*KINDS, *TEMPLATES))} or a file of triangles"
-            f" or quads: {', '.join(GARMENT_FORMATS)} (':as=top' after its name dresses it like a"
-            " template)."
-        )
-    raw = read_mesh(path)
+    raw, placement = place_file(item, body)
+    return garment_of(path, raw, placement, kind, body)
+
+
+def garment_of(
+    path: str | pathlib.Path,
+    raw: StaticMesh,
+    placement: Placement,
+    kind: Template | None,
+    body: Body,
+) -> tuple[Garment, GarmentReport]:
+    """Makes a garment of a mesh that was placed on the body, and its report."""
+    v, unit, up = placement.vertices, placement.unit, placement.up
     mesh = body.rest_mesh()
-    v, unit, up, posed = locate_on_body(path, raw.vertices, body, raw.faces)
     distance, _ = clearance(mesh, v)
     moved, inside = lift_out(mesh, v, raw.faces, NEAREST)
     kind = guess_template(moved, raw.faces) if kind is None else kind
@@ -170,7 +198,9 @@ def _load(
     )
     garment = dataclasses.replace(garment, polygons=raw.polygons)
     report = _report(str(path), unit, up, v, raw.faces, inside, distance, kind)
-    return garment, dataclasses.replace(report, posed=posed)
+    return garment, dataclasses.replace(
+        report, pose=placement.pose, placed=placement.notes, openings=placement.openings
+    )
 
 
 def _report(

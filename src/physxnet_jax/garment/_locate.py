@@ -1,36 +1,59 @@
 """Locates a garment mesh on the body: its unit, up axis and pose."""
 
-import functools
+import dataclasses
 import pathlib
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from scipy.spatial import KDTree
 
-from ..body import NUM_BODY_VERTICES, Body, load_body, t_pose
+from ..body import Body
 from ..errors import MeshError
 from ..geometry import (
     TriMesh,
     closest_among,
+    connected_components,
     nearby_faces,
     padded_rows,
     smoothing_matrix,
-    vertex_normals,
 )
+from ..io import StaticMesh
 from ._garment import carried_weights
+from ._openings import Opening
+from ._poses import PosedBody, posed_bodies
+from ._search import FRAMES, UNITS, Placed, Search, choose, plausible_units, turns
 
-UNITS = {"m": 1.0, "dm": 0.1, "cm": 0.01, "inch": 0.0254, "mm": 0.001}
-# A garment stands on the floor if its misfit there is below this share of that at the origin [1].
-_FLOOR_RATIO = 0.6
-# Misfit up to which other poses aren't tried, and above which a garment is misplaced [m]; share
-# of the rest-pose misfit below which a T-pose is accepted [1].
-_GOOD_FIT, _MAX_MISFIT, _T_POSE_RATIO = 0.015, 0.12, 0.75
-# Distance from the skin within which a cape is held [m].
-_CONTACT_DISTANCE = 0.03
+# Cost above which a garment is refused if nothing holds it where its file has it [m].
+_MAX_COST = 0.09
+# A single flat part is refused above this cost [m]; parts thinner than this share of their length
+# are flat [1].
+_FLAT_COST, _THIN = 0.06, 0.01
+# Shifts below this aren't worth a note [m].
+_NOTED = 0.005
+_MAX_PANELS = 200
+# Sizes of garments whose unit the user gives [m].
+_SMALLEST, _LARGEST = 0.05, 5.0
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Hints:
+    """What is known of a file's axes and unit.
+
+    Attributes:
+        unit: Name of its unit, or metres for each of its units.
+        up: Axis that points up, one of `AXES`.
+        front: Axis that the garment faces, one of `AXES`.
+    """
+
+    unit: str | float | None = None
+    up: str | None = None
+    front: str | None = None
+
+
+NO_HINTS = Hints()
 
 
 class Placement(NamedTuple):
@@ -38,150 +61,159 @@ class Placement(NamedTuple):
 
     Attributes:
         vertices: Positions [m], shape [vertices, 3].
-        unit: The unit of its file.
+        unit: The unit of its file, or the scale to metres.
         up: The up axis.
-        posed: Whether it was modelled in a T-pose and moved to the rest pose.
+        pose: The pose of the body that it was modelled on, a key of `POSES`; it was moved to
+            the rest pose.
+        notes: What was done beyond reading unit and up axis, a sentence each.
+        openings: Its openings and the limbs that pass through them.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
     unit: str
     up: str
-    posed: bool = False
+    pose: str
+    notes: tuple[str, ...]
+    openings: tuple[Opening, ...]
+
+    @property
+    def posed(self) -> bool:
+        """Whether it was modelled in another pose than rest."""
+        return self.pose != "rest"
 
 
 def locate_on_body(
-    path: pathlib.Path,
-    vertices: Float[np.ndarray, "vertices 3"],
-    body: Body,
-    faces: Int[np.ndarray, "faces 3"],
+    path: pathlib.Path, mesh: StaticMesh, body: Body, hints: Hints = NO_HINTS
 ) -> Placement:
-    """Converts a mesh to metres with the unit, axis and pose that bring it closest to the skin.
+    """Converts a mesh to metres on the body at rest.
 
-    A mesh that lies closer to the body in a T-pose is moved to the rest pose with the skin
-    beneath it.
+    Unit, axes, pose and position are those that the evidence speaks for: what the file declares,
+    the distance from the skin, the limbs that pass through its openings, and the side on which
+    its neckline is low. A mesh that was modelled on a body in another pose is moved to the rest
+    pose with the skin beneath it.
 
     Args:
         path: File name for the error message.
-        vertices: Vertices in the file's unit and axes.
+        mesh: The mesh in the file's unit and axes.
         body: The body.
-        faces: Triangles of the mesh.
+        hints: What the user says of the file.
 
     Raises:
-        MeshError: No unit and up axis places the mesh on the body.
+        MeshError: Nothing places the mesh on the body, or it is a flat sewing pattern.
     """
-    score, v, unit, up = _best_placement(vertices, body.rest_mesh())
-    # A good fit needn't be compared with other poses.
-    if score > _GOOD_FIT:
-        pose = _cached_t_pose(body)
-        other = _best_placement(vertices, pose.skin)
-        if other[0] < _T_POSE_RATIO * score:
-            score, v, unit, up = other
-            if score <= _MAX_MISFIT:
-                return Placement(_to_rest_pose(v, faces, body, pose), unit, up, True)
-    if score > _MAX_MISFIT and _hangs_free(vertices, body.rest_mesh()):
-        return Placement(np.asarray(vertices, np.float64), "m", "Y")
-    if score > _MAX_MISFIT:
-        size = np.ptp(vertices, axis=0)
-        raise MeshError(
-            f"{path}: no unit and up axis puts this mesh on the body: it measures"
-            f" {size[0]:.3g} x {size[1]:.3g} x {size[2]:.3g} and is"
-            f" {score:.2f} m away on average. Scale and move it with physxnet fit"
-            f" {path} --like top (or bottom, dress), or place it on the body at rest, which"
-            " physxnet export-rest writes (A-pose, Y up, origin in the pelvis), and export again."
+    search = Search(mesh.vertices, mesh.faces, posed_bodies(body))
+    size = float(np.ptp(mesh.vertices, axis=0).max())
+    notes, found = [], None
+    turned = turns(hints.up or mesh.up, hints.front)
+    units = plausible_units(size) if hints.unit is None else _given(hints.unit, size)
+    if hints.unit is None and mesh.unit is not None:
+        # What a file declares is true unless it is impossible.
+        found = choose(search, {k: s for k, s in units.items() if k == mesh.unit}, turned)
+        if found is None or not _stands(found, hints):
+            notes.append(f"its file declares {mesh.unit}, which puts it on no part of the body.")
+            found = None
+    if found is None:
+        found = choose(search, units, turned)
+    panels = _flat_parts(mesh)
+    if found is None or not _stands(found, hints) or (panels and found.cost > _FLAT_COST):
+        raise MeshError(_refusal(path, mesh, found, panels))
+    return placement_of(search, found, mesh, body, notes)
+
+
+def placement_of(
+    search: Search, found: Placed, mesh: StaticMesh, body: Body, notes: Sequence[str] = ()
+) -> Placement:
+    """The placement of a mesh on the body at rest, from its place on a posed body."""
+    v = found.apply(search.vertices)
+    if found.pose != "rest":
+        v = _to_rest_pose(v, mesh.faces, body, search.poses[found.pose])
+    return Placement(
+        v,
+        found.unit,
+        found.turn.up,
+        found.pose,
+        (*notes, *_notes(found)),
+        tuple(found.openings),
+    )
+
+
+def _given(unit: str | float, size: float) -> dict[str, float]:
+    """The user's unit, unless no garment is of this size in it."""
+    name, scale = (unit, UNITS[unit]) if isinstance(unit, str) else (f"{unit:g} m", float(unit))
+    return {name: scale} if _SMALLEST < size * scale < _LARGEST else {}
+
+
+def _stands(found: Placed, hints: Hints) -> bool:
+    """Whether a garment is near enough to the body, or held by it as a cape is."""
+    as_is = found.frame == "origin" and (found.turn.up == "Y" or hints.up is not None)
+    limit = _MAX_COST if hints == NO_HINTS else 2.0 * _MAX_COST
+    return found.cost < limit or (found.held and as_is)
+
+
+def _notes(found: Placed) -> list[str]:
+    """Sentences on how a garment was placed."""
+    out = []
+    if found.turn.degrees:
+        out.append(f"turned by {found.turn.degrees} degrees: it faced the other way.")
+    if found.frame == "floor":
+        out.append("its floor was put under the feet.")
+    elif found.frame in FRAMES:
+        out.append(
+            f"raised by {100 * found.shift[1]:.0f} cm: it stood as clothes made on {found.frame}"
+            " do, whose origin is in the chest."
         )
-    return Placement(v, unit, up)
+    elif np.abs(found.shift).max() > _NOTED and found.frame == "found":
+        x, y, z = 100 * found.shift
+        out.append(f"moved to where it fits: {x:+.0f}, {y:+.0f}, {z:+.0f} cm (x, y, z).")
+    if found.pose != "rest":
+        out.append(
+            f"modelled on a body in another pose ({found.pose}); sleeves and legs are turned"
+            " with the limbs."
+        )
+    return out
 
 
-def _hangs_free(vertices: Float[np.ndarray, "vertices 3"], mesh: TriMesh) -> bool:
-    """Whether a mesh in metres is held close to the body, as a cape, and hangs free elsewhere."""
-    if not 0.1 < np.ptp(vertices, axis=0).max() < 2.5:
-        return False
-    points = np.asarray(mesh.vertices)
-    normals = np.asarray(vertex_normals(mesh.vertices, mesh.faces))
-    distance, nearest = KDTree(points).query(vertices)
-    out = np.einsum("vc,vc->v", vertices - points[nearest], normals[nearest])
-    return bool(np.quantile(distance, 0.05) < _CONTACT_DISTANCE and np.mean(out < 0) < 0.05)
+def _refusal(path: pathlib.Path, mesh: StaticMesh, found: Placed | None, panels: int) -> str:
+    size = " x ".join(f"{s:.3g}" for s in np.ptp(mesh.vertices, axis=0))
+    if panels:
+        return (
+            f"{path}: {panels} flat panels ({size}), as of a sewing pattern that was never sewn."
+            if panels > 1
+            else f"{path}: a flat sheet ({size}) that was never put round a body."
+        ) + " Sew it in the program that made it, drape it on the avatar, and export that."
+    how = (
+        "no unit makes it as large as a garment"
+        if found is None
+        else f"the best place, in {found.unit}, leaves it {found.misfit:.2f} m away on average"
+    )
+    return (
+        f"{path}: no unit and up axis puts this mesh on the body: it measures {size}, and {how}."
+        f" Name its unit and axes ({path}:unit=cm,up=z), scale and move it with physxnet fit"
+        f" {path} --like top (or bottom, dress), or place it on the body at rest, which"
+        " physxnet export-rest writes (A-pose, Y up, origin in the pelvis), and export again."
+    )
 
 
-def _best_placement(
-    vertices: Float[np.ndarray, "vertices 3"], mesh: TriMesh
-) -> tuple[float, Float[np.ndarray, "vertices 3"], str, str]:
-    """The smallest misfit [m], the positions there [m], and the unit and up axis."""
-    skin = np.asarray(mesh.vertices)
-    misfit = skin_misfit(mesh)
-    floor = np.array([0.0, float(skin[:, 1].min()), 0.0])
-    best = (np.inf, vertices, "m", "Y")
-    for up in ("Y", "Z"):
-        turned = vertices if up == "Y" else vertices[:, [0, 2, 1]] * [1.0, 1.0, -1.0]
-        for unit, scale in UNITS.items():
-            if not 0.1 < np.ptp(turned * scale, axis=0).max() < 2.5:
-                continue
-            unmoved = np.inf
-            for shift in (np.zeros(3), floor):
-                v = turned * scale + shift
-                # A garment scaled by too small a unit is close to the skin, but inside it.
-                score = misfit(v, 0.015)
-                # Legs are close to any misplaced mesh around them, so the floor has to fit
-                # far better than the origin.
-                if shift.any() and score > _FLOOR_RATIO * unmoved:
-                    continue
-                unmoved = score
-                if score < best[0] - 1e-9:
-                    best = (score, v, unit, up)
-    return best
-
-
-def skin_misfit(skin: TriMesh) -> Callable[[Float[np.ndarray, "vertices 3"], float], float]:
-    """Returns a function of vertices and a depth [m] that measures their misfit to the body [m].
-
-    The misfit is the mean distance from the skin plus 0.2 times the share of vertices deeper
-    than the given depth.
-    """
-    points = np.asarray(skin.vertices)
-    normals = np.asarray(vertex_normals(skin.vertices, skin.faces))
-    tree = KDTree(points)
-
-    def misfit(vertices: Float[np.ndarray, "vertices 3"], depth_limit: float) -> float:
-        distance, nearest = tree.query(vertices)
-        depth = np.einsum("ij,ij->i", points[nearest] - vertices, normals[nearest])
-        return float(np.mean(distance)) + 0.2 * float(np.mean(depth > depth_limit))
-
-    return misfit
-
-
-class _Pose(NamedTuple):
-    """The skin of a posed body, and the transforms of its joints."""
-
-    skin: TriMesh
-    rotations: Float[np.ndarray, "joints 3 3"]
-    translations: Float[np.ndarray, "joints 3"]
-
-
-def _cached_t_pose(body: Body) -> _Pose:
-    return _builtin_t_pose() if body is load_body() else _compute_t_pose(body)
-
-
-@functools.cache
-def _builtin_t_pose() -> _Pose:
-    return _compute_t_pose(load_body())
-
-
-def _compute_t_pose(body: Body) -> _Pose:
-    rest = body.rest_vertices(body.default_shape())
-    root = body.joint_positions(rest)[0][0]
-    r, t = (np.asarray(x, np.float64) for x in body.transforms(rest, t_pose(body), root))
-    weights = np.asarray(body.weights)[:NUM_BODY_VERTICES]
-    x = np.asarray(rest, np.float64)[:NUM_BODY_VERTICES]
-    moved = np.einsum("vab,vb->va", np.einsum("vj,jab->vab", weights, r), x) + weights @ t
-    mesh = body.rest_mesh()
-    return _Pose(mesh.replace(vertices=jnp.asarray(moved, jnp.float32)), r, t)
+def _flat_parts(mesh: StaticMesh) -> int:
+    """Number of parts of a mesh if all of them are flat, else 0."""
+    label = connected_components(mesh.faces, len(mesh.vertices))
+    used = np.unique(mesh.faces)
+    parts = np.unique(label[used])
+    if len(parts) > _MAX_PANELS:
+        return 0
+    for part in parts:
+        x = mesh.vertices[used[label[used] == part]]
+        length = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
+        if len(x) > 3 and length[2] > _THIN * length[0]:
+            return 0
+    return len(parts)
 
 
 def _to_rest_pose(
     vertices: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
     body: Body,
-    pose: _Pose,
+    pose: PosedBody,
 ) -> Float[np.ndarray, "vertices 3"]:
     """Moves cloth on a posed body to the rest pose by inverting the skinning beneath it [m]."""
     weights = nearest_skin(pose.skin, body, vertices, faces)[2].astype(np.float64)

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 
 from ..errors import PhysXNetError
 from ._garment import FABRICS, TEMPLATES, Garment, Template
+from ._search import AXES, UNITS
 from .tailoring import KINDS, MEASURES
 
+_PLACE = ("unit", "up", "front")
 _OPTIONS = re.compile(r"^(?P<name>.+?):(?P<options>\w+=[^:,=]*(?:,\w+=[^:,=]*)*)$")
 
 
@@ -19,6 +21,9 @@ class WearItem:
     Attributes:
         name: A template, a kind that the tailor makes, or a garment file.
         template: Template that dresses a file (``as``); guessed from its shape if None.
+        unit: Unit of a file; found if None.
+        up: The axis of a file that points up, one of ``x``, ``y``, ``z`` or their negatives.
+        front: The axis of a file that the garment faces, likewise.
         fabric: Name of a fabric that replaces its own; None keeps it.
         measures: Measures of a tailored garment [m].
         hold: Curves of a tailored garment that are fixed to the body.
@@ -26,6 +31,9 @@ class WearItem:
 
     name: str
     template: Template | None = None
+    unit: str | None = None
+    up: str | None = None
+    front: str | None = None
     fabric: str | None = None
     measures: dict[str, float] = dataclasses.field(default_factory=dict)
     hold: tuple[str, ...] = ()
@@ -33,6 +41,7 @@ class WearItem:
     def word(self, name: str) -> str:
         """The word that `parse_wear` reads, under another name and without the fabric."""
         options = [f"as={self.template}"] if self.template else []
+        options += [f"{k}={getattr(self, k)}" for k in _PLACE if getattr(self, k)]
         options += [f"{k}={v:g}" for k, v in self.measures.items()]
         options += [f"hold={'+'.join(self.hold)}"] if self.hold else []
         return f"{name}:{','.join(options)}" if options else name
@@ -43,15 +52,17 @@ def parse_wear(word: str | pathlib.Path) -> WearItem:
 
     Args:
         word: A template, a kind of garment or a file, with its options: ``fabric``; for a file
-            ``as``, its template; for a tailored garment its measures [m] and ``hold``, curves
+            ``as``, its template, and ``unit``, ``up`` and ``front`` where they can't be found
+            (``up=z,front=-y``); for a tailored garment its measures [m] and ``hold``, curves
             joined by ``+`` that are fixed to the body.
 
     Raises:
         PhysXNetError: A key, template, fabric or number is wrong.
 
     Example:
-        >>> parse_wear("coat.obj:as=top,fabric=wool")
-        WearItem(name='coat.obj', template='top', fabric='wool', measures={}, hold=())
+        >>> item = parse_wear("coat.obj:as=top,fabric=wool")
+        >>> item.name, item.template, item.fabric
+        ('coat.obj', 'top', 'wool')
         >>> parse_wear("tee:ease=0.1").measures
         {'ease': 0.1}
     """
@@ -60,9 +71,15 @@ def parse_wear(word: str | pathlib.Path) -> WearItem:
         return WearItem(name=str(word))
     pairs = (part.partition("=") for part in found["options"].split(","))
     options = {key: value for key, _, value in pairs}
-    known = {"as": TEMPLATES, "fabric": tuple(FABRICS)}
+    known = {
+        "as": TEMPLATES,
+        "fabric": tuple(FABRICS),
+        "unit": tuple(UNITS),
+        "up": AXES,
+        "front": AXES,
+    }
     tailored = found["name"] in KINDS
-    allowed = ("fabric", "hold", *MEASURES) if tailored else ("as", "fabric")
+    allowed = ("fabric", "hold", *MEASURES) if tailored else ("as", "fabric", *_PLACE)
     measures = {}
     for key, value in options.items():
         if key not in allowed:
@@ -71,10 +88,13 @@ def parse_wear(word: str | pathlib.Path) -> WearItem:
             raise PhysXNetError(f"{word}: {key} is one of {', '.join(known[key])}.")
         if key in MEASURES:
             measures[key] = _number(word, key, value)
+    if "up" in options and options.get("front", "")[-1:] == options["up"][-1]:
+        raise PhysXNetError(f"{word}: up and front are the same axis.")
     template: Template | None = options.get("as")  # pyright: ignore[reportAssignmentType]
     return WearItem(
         name=found["name"],
         template=template,
+        **{k: options[k] for k in _PLACE if k in options},
         fabric=options.get("fabric"),
         measures=measures,
         hold=tuple(options["hold"].split("+")) if "hold" in options else (),

@@ -78,6 +78,8 @@ class StaticMesh:
             recovered from the triangles.
         count: Number of faces before triangulation.
         parts: Names of the meshes that it was joined from, if the file names them.
+        unit: The unit that the file declares, ``m``; None if it declares none.
+        up: The up axis that it declares, ``y`` or ``z``; None if it declares none.
     """
 
     vertices: Float[np.ndarray, "vertices 3"]
@@ -87,6 +89,8 @@ class StaticMesh:
     polygons: Polygons | None
     count: int
     parts: tuple[str, ...] = ()
+    unit: str | None = None
+    up: str | None = None
 
 
 def vertex_velocities(

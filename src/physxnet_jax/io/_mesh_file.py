@@ -59,16 +59,21 @@ def read_mesh(path: str | pathlib.Path) -> StaticMesh:
         if part is not None:
             raise FormatError(f"{path}: holds one mesh, so '#{part}' has no meaning. Leave it out.")
         return _read_plain(path)
-    if suffix in (".glb", ".gltf"):
-        from ._gltf_mesh import read_gltf_still as read
-    else:
-        from ._usd_mesh import read_usd_still as read
     # Damaged files may contain infinities, which are rejected below.
     with np.errstate(all="ignore"):
-        parts = read(path)
+        if suffix in (".glb", ".gltf"):
+            from ._gltf_mesh import read_gltf_still
+
+            # The format prescribes both.
+            parts, unit, up = read_gltf_still(path), "m", "y"
+        else:
+            from ._usd_mesh import read_usd_still
+
+            parts, unit, up = read_usd_still(path)
     if not parts:
         raise FormatError(f"{path}: no mesh in it. Export the mesh with its faces.")
-    return _static_mesh(path, named(path, parts, part, "Choose another after the #"))
+    mesh = _static_mesh(path, named(path, parts, part, "Choose another after the #"))
+    return dataclasses.replace(mesh, unit=unit, up=up)
 
 
 def split_part(path: str | pathlib.Path) -> tuple[pathlib.Path, str | None]:

@@ -44,17 +44,24 @@ def read_usd_meshes(
         return _read_moving(path, fps)
 
 
-def read_usd_still(path: pathlib.Path) -> list[SourceMesh]:
+def read_usd_still(path: pathlib.Path) -> tuple[list[SourceMesh], str | None, str | None]:
     """Reads every mesh of a stage at its start, in world space; skins in their bind pose.
+
+    Returns:
+        The meshes, ``m`` if the stage declares its unit, and the up axis that it declares.
 
     Raises:
         FormatError: The stage is damaged or too large.
         MissingDependencyError: usd-core isn't installed.
     """
     with _report_damage(path):
+        from pxr import UsdGeom
+
         stage = _open_stage(path)
         code = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
-        return list(_meshes(path, stage, np.array([code]), bound=True).values())
+        parts = list(_meshes(path, stage, np.array([code]), bound=True).values())
+        unit = "m" if UsdGeom.StageHasAuthoredMetersPerUnit(stage) else None
+        return parts, unit, _up_axis(stage)
 
 
 @contextlib.contextmanager
@@ -137,8 +144,17 @@ def _read_moving(
         for prim_path, part in _meshes(path, stage, codes, bound=False).items()
     ]
     moving = [p for p in parts if np.ptp(p.positions, axis=0).max() > 0] or parts
-    up = str(UsdGeom.GetStageUpAxis(stage)) if stage.HasAuthoredMetadata("upAxis") else None
-    return moving, float(rate * subdivisions), up
+    up = _up_axis(stage)
+    return moving, float(rate * subdivisions), None if up is None else up.upper()
+
+
+def _up_axis(stage: Any) -> str | None:
+    """The up axis that a stage declares, ``y`` or ``z``."""
+    from pxr import UsdGeom
+
+    if not stage.HasAuthoredMetadata("upAxis"):
+        return None
+    return str(UsdGeom.GetStageUpAxis(stage)).lower()
 
 
 def _bind_poses(
