@@ -125,6 +125,7 @@ def test_fitting_moves_cloth_out_of_the_body(tmp_path, trousers):
     assert after.inside < 0.25 * found.inside
 
 
+@pytest.mark.release
 def test_misplaced_mesh_is_aligned_to_the_template(tmp_path, trousers):
     v, faces = trousers
     path = saved(tmp_path, "far.obj", 7.3 * v + [40.0, -3.0, 9.0], faces)

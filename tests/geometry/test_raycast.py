@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from physxnet_jax.geometry import cast_rays, make_mesh
+from physxnet_jax.geometry import cast_rays, cast_rays_within, make_mesh
 
 
 @pytest.fixture(scope="module")
@@ -106,3 +106,26 @@ def test_gradient_of_the_distance_is_finite_and_correct(sphere):
         return cast_rays(sphere, origin, jnp.array([[0.0, 0.0, 1.0]])).distance[0]
 
     assert float(jax.grad(height)(jnp.float32(0.1))) == pytest.approx(-1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize("reach", [0.02, 0.2, 3.0])
+def test_rays_of_limited_reach_find_what_all_rays_find(reach):
+    """Block by block among the triangles in reach, of a body's size and finer."""
+    rng = np.random.default_rng(5)
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.3)
+    mesh = make_mesh(np.asarray(sphere.vertices), np.asarray(sphere.faces))
+    origins = rng.normal(size=(700, 3)).astype(np.float32) * 0.3
+    directions = rng.normal(size=(700, 3)).astype(np.float32)
+    directions[::50] = 0.0
+    limit = np.full(700, reach, np.float32)
+    found = cast_rays_within(mesh, origins, directions, limit)
+    every = cast_rays(
+        mesh, jnp.asarray(origins), jnp.asarray(directions), both=True, max_distance=reach
+    )
+    np.testing.assert_array_equal(found.valid, every.valid)
+    hit = np.asarray(found.valid)
+    assert hit.any() and not hit[::50].any()
+    np.testing.assert_allclose(found.distance[hit], every.distance[hit], atol=1e-6)
+    same = np.asarray(found.face)[hit] == np.asarray(every.face)[hit]
+    assert same.mean() > 0.99
+    np.testing.assert_allclose(found.weights[hit][same], every.weights[hit][same], atol=1e-4)

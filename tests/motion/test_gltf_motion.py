@@ -11,13 +11,16 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 from scipy.spatial.transform import Rotation
 
+from physxnet_jax.body import t_pose
 from physxnet_jax.errors import MotionError
 from physxnet_jax.io._gltf_file import GltfFile
 from physxnet_jax.motion import (
     JOINT_MAPS,
     LIMBS,
     clip_transforms,
+    inspect_motion,
     load_motion,
+    make_motion,
     procedural_clip,
     read_gltf,
 )
@@ -477,3 +480,52 @@ def test_animation_starts_at_its_first_key(tmp_path):
     at, fps = file.frame_times()
     assert fps == 10.0 and len(at) == 4
     np.testing.assert_allclose(file.world(at)[:, 0, 0, 3], [0, 1, 2, 3], atol=1e-5)
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+def test_a_t_pose_in_the_first_key_is_dropped(body, rest, tmp_path, leaves):
+    """The control: a person who stays in it isn't cut."""
+    walk = procedural_clip("walk", fps=30.0)
+    turns = np.array(walk.rotations)
+    pose = np.asarray(t_pose(body))
+    turns[: 1 if leaves else 12] = pose
+    clip = make_motion(turns, np.asarray(walk.root), 30.0)
+    path = write_gltf(tmp_path / "a.glb", body, rest, clip)
+    again = load_motion(path)
+    assert again.num_frames == walk.num_frames - leaves
+    note = inspect_motion(path).reference
+    assert ("dropped" in note) == leaves
+    if leaves:
+        kept = make_motion(turns[1:], np.asarray(walk.root)[1:], 30.0)
+        assert limbs_apart(body, rest, kept, again) < 0.5
+
+
+def test_the_longest_animation_is_read_and_others_are_named(body, rest, tmp_path):
+    walk = procedural_clip("walk", fps=30.0)
+    path = write_gltf(tmp_path / "a.glb", body, rest, walk)
+    short = make_motion(np.asarray(walk.rotations)[:4], np.asarray(walk.root)[:4], 30.0)
+    other = pygltflib.GLTF2().load(str(write_gltf(tmp_path / "b.glb", body, rest, short)))
+    both = pygltflib.GLTF2().load(str(path))
+    blob, more = both.binary_blob(), other.binary_blob()
+    views, accessors = len(both.bufferViews), len(both.accessors)
+    for view in other.bufferViews:
+        view.byteOffset += len(blob)
+        both.bufferViews.append(view)
+    for accessor in other.accessors:
+        accessor.bufferView += views
+        both.accessors.append(accessor)
+    for sampler in other.animations[0].samplers:
+        sampler.input += accessors
+        sampler.output += accessors
+    both.animations[0].name, other.animations[0].name = "Walk", "Start"
+    both.animations.insert(0, other.animations[0])
+    both.buffers[0].byteLength = len(blob) + len(more)
+    both.set_binary_blob(blob + more)
+    both.save(str(path))
+    assert load_motion(path).num_frames == walk.num_frames
+    assert load_motion(f"{path}#Start").num_frames == 4
+    assert load_motion(f"{path}#Walk").num_frames == walk.num_frames
+    assert any("'Walk' is read" in n and "Start" in n for n in inspect_motion(path).notes)
+    assert not any("is read" in n for n in inspect_motion(f"{path}#Start").notes)
+    with pytest.raises(MotionError, match="no animation 'Run'; there are Start, Walk"):
+        load_motion(f"{path}#Run")

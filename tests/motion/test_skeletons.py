@@ -1,6 +1,7 @@
 """Skeletons of other makers: a known motion told in their names and axes comes back."""
 
 import pathlib
+import re
 import runpy
 
 import numpy as np
@@ -14,11 +15,13 @@ from physxnet_jax.motion import (
     LIMBS,
     clip_transforms,
     find_joint_map,
+    foot_heights,
     load_motion,
     make_motion,
     procedural_clip,
     read_bvh,
     read_joint_map,
+    stand_on_floor,
 )
 
 X_ALONG_BONE = "lafan"
@@ -260,3 +263,71 @@ def test_non_text_joint_map_is_refused(tmp_path):
     path.write_bytes(b"\xff\xfe\x00broken")
     with pytest.raises(MotionError, match="joint map"):
         read_joint_map(path)
+
+
+SIDE_BEHIND = {
+    "vrm": ("{}_L", "{}_R"),
+    "mixamo": ("{}.l", "{}.r"),
+    "unreal-4": ("{}-left", "{}-right"),
+}
+
+
+@pytest.mark.parametrize("family", sorted(SIDE_BEHIND))
+def test_sides_may_stand_behind_names(body, rest, tmp_path, family):
+    """UpperArm_L, arm.l, hand left; the control: a letter without a mark belongs to the name."""
+    walk = procedural_clip("walk", fps=15.0)
+    names = {}
+    left, right = SIDE_BEHIND[family]
+    for b, s in JOINT_MAPS[family].items():
+        pattern = left if b.startswith("Left") else right if b.startswith("Right") else "{}"
+        plain = s.removeprefix("left").removeprefix("right").removeprefix("Left")
+        plain = plain.removeprefix("Right").removesuffix("_l").removesuffix("_r")
+        names[b] = pattern.format(plain)
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(body, rest, walk, names))
+    assert find_joint_map(read_bvh(path))[1] == names
+    assert limbs_apart(body, rest, walk, load_motion(path)) < 0.1
+    joined = {b: re.sub("[-_.]", "x", n) for b, n in names.items()}
+    path.write_text(bvh(body, rest, walk, joined))
+    with pytest.raises(MotionError, match="unknown joints"):
+        load_motion(path)
+
+
+@pytest.mark.parametrize("degrees_", [-40.0, 28.0])
+def test_twist_of_the_trunk_comes_from_hips_and_shoulders(body, rest, tmp_path, degrees_):
+    """A person who stands twisted all the time, told with X along the bones."""
+    turns = np.tile([1.0, 0.0, 0.0, 0.0], (6, len(body.joint_names), 1))
+    half = 0.5 * np.radians(degrees_)
+    turns[:, body.joint("Spine")] = [np.cos(half), 0.0, np.sin(half), 0.0]
+    clip = make_motion(turns, np.zeros((6, 3)), 30.0)
+    path = tmp_path / "a.bvh"
+    path.write_text(bvh(body, rest, clip, JOINT_MAPS["lafan"], along_bones(body, rest)))
+    again = load_motion(path)
+    heads = np.asarray(body.joint_positions(rest)[0], np.float64)
+
+    def twist(motion):
+        world, shift = (np.asarray(x, np.float64) for x in clip_transforms(body, rest, motion))
+        at = np.einsum("fjab,jb->fja", world, heads) + shift
+        yaw = []
+        for name in ("UpLeg", "Arm"):
+            line = at[0, body.joint(f"Left{name}")] - at[0, body.joint(f"Right{name}")]
+            yaw.append(np.degrees(np.arctan2(-line[2], line[0])))
+        return yaw[1] - yaw[0]
+
+    assert twist(clip) == pytest.approx(degrees_, abs=1.0)
+    assert twist(again) == pytest.approx(degrees_, abs=2.0)
+    # Arms keep their directions.
+    assert limbs_apart(body, rest, clip, again) < 0.5
+
+
+def test_one_frame_through_the_floor_does_not_lift_the_others(body, rest):
+    """The control: feet that go below it in many frames are on it."""
+    walk = procedural_clip("walk", fps=30.0)
+    frames = walk.num_frames
+    for share, hover in ((1, False), (frames // 4, True)):
+        root = np.array(walk.root)
+        root[:share, 1] -= 0.11
+        clip = stand_on_floor(body, make_motion(walk.rotations, root, 30.0), rest)
+        heights = foot_heights(body, clip, rest)
+        assert (np.median(heights) > 0.09) == hover
+        assert float(np.quantile(heights, 0.2 if hover else 0.5)) == pytest.approx(0.0, abs=0.03)

@@ -14,7 +14,7 @@ from ..dressing import Inspection, fit_garment, inspect_garment
 from ..errors import MeshError
 from ..garment import Opening, template
 from ..io import GltfFile, write_obj
-from ..motion import CLIPS, MotionInspection, inspect_motion
+from ..motion import CLIPS, MotionInspection, inspect_motion, split_animation
 from ._commands import ExportRest, Fit, Inspect
 from ._progress import print_json, progress_bars
 from ._shape import parse_shape
@@ -52,6 +52,7 @@ def inspect(command: Inspect, console: Console) -> int:
 
 def _is_motion(file: pathlib.Path) -> bool:
     """Whether a file contains motion and no mesh."""
+    file = split_animation(file)[0]
     suffix = file.suffix.lower()
     if suffix in _MOTION_SUFFIXES or str(file) in CLIPS:
         return True

@@ -30,20 +30,20 @@ from ..garment import (
     locate_on_body,
     mesh_health,
     parse_wear,
-    place_file,
+    place_mesh,
     template,
 )
 from ..geometry import TriMesh, make_mesh, vertex_normals, visible_skin
 from ..io import StaticMesh, mesh_name, read_mesh
-from ..uv import bind, garment_map_rows, make_atlas
+from ..uv import hit_rate
 
 # Share of vertices inside [1], median edge [m] and share of missing rays [1] worth reporting.
 _INSIDE, _FINE, _MAX_MISSED = 0.02, 0.003, 0.1
 # Cloth is over skin up to this distance, and this much aside of the normal [m]; share of the skin
 # that something worn covers, and share of visible skin worth reporting [1]; size of the pictures.
 _OVER, _ASIDE, _BARE, _SHOWS, _PIXELS = 0.15, 0.02, 0.005, 0.01, 256
-# Smallest extent of a garment [m], and largest number of meshes of a file to examine.
-_MIN_EXTENT, _MAX_PARTS = 0.25, 20
+# Smallest extent of a garment [m]; largest numbers of a file's meshes and faces to examine.
+_MIN_EXTENT, _MAX_PARTS, _MOST_FACES = 0.25, 20, 5000
 # A better placement has to bring a garment nearer to the skin by this factor; below this hit
 # rate, a garment far from the skin may be misplaced [1].
 _DISTANCE_RATIO, _MIN_HIT_RATE = 0.85, 0.5
@@ -135,7 +135,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     raw = read_mesh(path)
     skin = body.rest_mesh()
     try:
-        raw, placement = place_file(item, body)
+        placement = place_mesh(item, raw, body)
     except MeshError as error:
         return _misplaced(path, raw, body, str(error).partition(": ")[2])
     v = placement.vertices
@@ -144,15 +144,16 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     distance, _ = clearance(skin, np.asarray(v, np.float32))
     inside = float(np.mean(distance < NEAREST))
     hangs = hangs_off(v, distance)
-    corner = np.asarray(v)[raw.faces]
+    some = np.unique(np.linspace(0, len(raw.faces) - 1, _MOST_FACES).astype(int))
+    corner = np.asarray(v)[raw.faces[some]]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     _, away = clearance(skin, corner.mean(axis=1).astype(np.float32))
     outward = float(np.mean(np.einsum("fi,fi->f", normal, away) > 0))
     garment, _ = garment_of(path, raw, placement, item.template, body)
-    hit_rate = _hit_rate(body, garment)
+    rate = hit_rate(garment, body=body, rest=body.rest_vertices(body.default_shape()))
     found = _Findings([], [], [])
     _report_mesh(found, health, outward)
-    _report_placement(found, raw, distance, inside, hit_rate, body)
+    _report_placement(found, raw, distance, inside, rate, body)
     _report_size(found, health, hangs)
     outfit = _report_parts(found, path, raw, body)
     _report_images(found, raw)
@@ -165,9 +166,9 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
     _report_worn(found, placement.openings, covered, seen)
     if health.components > 1:
         found.notes.append(f"{health.components} disconnected parts: each moves independently.")
-    if hit_rate < 1 - _MAX_MISSED:
+    if rate < 1 - _MAX_MISSED:
         found.notes.append(
-            f"{100 * (1 - hit_rate):.0f} % of the vertices' rays miss the body; these vertices are"
+            f"{100 * (1 - rate):.0f} % of the vertices' rays miss the body; these vertices are"
             " bound to the closest skin."
         )
     return Inspection(
@@ -184,7 +185,7 @@ def inspect_garment(path: str | pathlib.Path, *, body: Body | None = None) -> In
         outward=outward,
         template=garment.template,
         apart=_template_distances(v),
-        hit_rate=hit_rate,
+        hit_rate=rate,
         openings=placement.openings,
         covered=covered,
         visible_skin=seen,
@@ -397,13 +398,6 @@ def _template_distances(vertices: np.ndarray) -> dict[Template, float]:
         ways = ((vertices, other), (other, vertices))
         out[name] = max(float(KDTree(a).query(b)[0].mean()) for a, b in ways)
     return out
-
-
-def _hit_rate(body: Body, garment: Garment) -> float:
-    rest = body.rest_vertices(body.default_shape())
-    atlas = make_atlas(32)
-    valid = garment_map_rows(atlas, body, rest, template(garment.template)).valid
-    return float(bind(garment, atlas=atlas, body=body, rest=rest, valid=valid).hit_rate)
 
 
 def _command(path: pathlib.Path, options: list[str]) -> str:

@@ -21,7 +21,7 @@ from ._load import (
     guess_template as guess_template,
     hangs_off as hangs_off,
     load_garment as load_garment,
-    place_file as place_file,
+    place_mesh as place_mesh,
 )
 from ._locate import (
     Hints as Hints,

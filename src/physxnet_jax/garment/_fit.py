@@ -22,6 +22,8 @@ from ..geometry import (
 )
 
 _ROWS = 2048
+# Hanging cloth farther from the skin than this isn't lifted off it [m].
+_NEAR = 0.03
 _closest_among = jax.jit(closest_among)
 
 
@@ -77,8 +79,12 @@ def set_clearance(
     v = np.asarray(vertices, dtype=np.float64).copy()
     loose = np.zeros(len(v)) if free is None else free
     average = smoothing_matrix(faces, len(v))
+    distance, away = (x.copy() for x in clearance(body, v))
+    # What hangs far from the skin never comes near it.
+    near = np.flatnonzero((loose < 1) | (distance < target + _NEAR))
     for step in range(iterations):
-        distance, away = clearance(body, v)
+        if step:
+            distance[near], away[near] = clearance(body, v[near])
         missing = target - distance
         missing = np.where(missing < 0, missing * (1 - loose), missing)
         move = missing[:, None] * away

@@ -142,13 +142,17 @@ def _tailored(
     return garment, _report(item.name, "m", "Y", v, faces, inside, distance, garment.template)
 
 
-def place_file(item: WearItem, body: Body) -> tuple[StaticMesh, Placement]:
-    """Reads a garment file and places it on the body.
+def place_mesh(item: WearItem, mesh: StaticMesh, body: Body) -> Placement:
+    """Places the mesh of a garment file on the body.
 
     Raises:
-        MeshError: The file isn't a mesh, or nothing places it on the body.
-        FormatError: The file can't be read.
+        MeshError: Nothing places it on the body.
     """
+    hints = Hints(unit=item.unit, up=item.up, front=item.front)
+    return locate_on_body(pathlib.Path(item.name), mesh, body, hints)
+
+
+def _read(item: WearItem) -> StaticMesh:
     path = pathlib.Path(item.name)
     if split_part(path)[0].suffix.lower() not in GARMENT_FORMATS:
         raise MeshError(
@@ -156,9 +160,7 @@ def place_file(item: WearItem, body: Body) -> tuple[StaticMesh, Placement]:
             f" or quads: {', '.join(GARMENT_FORMATS)} (':as=top' after its name dresses it like a"
             " template)."
         )
-    raw = read_mesh(path)
-    hints = Hints(unit=item.unit, up=item.up, front=item.front)
-    return raw, locate_on_body(path, raw, body, hints)
+    return read_mesh(path)
 
 
 def _load(item: WearItem, body: Body) -> tuple[Garment, GarmentReport]:
@@ -173,7 +175,8 @@ def _load(item: WearItem, body: Body) -> tuple[Garment, GarmentReport]:
         near = distance < NEAREST
         report = _report(str(path), "m", "Y", v, faces, near, distance, g.template)
         return g, report
-    raw, placement = place_file(item, body)
+    raw = _read(item)
+    placement = place_mesh(item, raw, body)
     return garment_of(path, raw, placement, kind, body)
 
 

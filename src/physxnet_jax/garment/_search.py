@@ -262,10 +262,11 @@ class Search:
 
     def found(self, units: dict[str, float], turned: Iterable[Turn]) -> list[Placed]:
         """Candidates at any height, refined."""
-        coarse = []
+        coarse, turned = [], list(turned)
+        grid = _GRID if len(turned) * len(units) < 8 else 2.0 * _GRID
         for (unit, scale), turn, pose in itertools.product(units.items(), turned, _POSES):
             points = self.coarse @ turn.matrix.T * scale
-            for shift in self._grid(scale, turn):
+            for shift in self._grid(scale, turn, grid):
                 cost = misfit(self.poses[pose], points + shift)[0] + _turned(turn)
                 cost += self._outside(points + shift)
                 coarse.append((cost, unit, scale, turn, pose, shift))
@@ -277,8 +278,9 @@ class Search:
             points = self.coarse @ turn.matrix.T * scale + shift
             cost = {n: misfit(self.poses[n], points)[0] for n in names}
             for name in sorted(cost, key=cost.__getitem__)[:2]:
-                best.append((unit, scale, turn, name, self._refine(scale, turn, name, shift)))
-        return sorted((self.judge(*b, "found") for b in best), key=lambda p: p.cost)
+                refined = self._refine(scale, turn, name, shift)
+                best.append(self.judge(unit, scale, turn, name, refined, "found"))
+        return sorted(best, key=lambda p: p.cost)
 
     def _aligned(self, scale: float, turn: Turn) -> np.ndarray:
         """Shift that aligns the bounding box with the template's, at the top."""
@@ -297,12 +299,12 @@ class Search:
             np.mean(np.maximum(points[:, 1] - high, 0) + np.maximum(low - points[:, 1], 0))
         )
 
-    def _grid(self, scale: float, turn: Turn) -> list[np.ndarray]:
+    def _grid(self, scale: float, turn: Turn, step: float) -> list[np.ndarray]:
         """Shifts that put a mesh on the body's axis, at every height."""
         x = self.vertices @ turn.matrix.T * scale
         low, high = x.min(axis=0), x.max(axis=0)
         middle = 0.5 * (low + high)
-        heights = np.arange(self.floor - 0.1 - low[1], 0.8 - high[1] + 1e-9, _GRID)
+        heights = np.arange(self.floor - 0.1 - low[1], 0.8 - high[1] + 1e-9, step)
         if not len(heights):
             heights = np.array([0.5 * (self.floor + 0.7) - middle[1]])
         return [np.array([-middle[0], y, 0.02 - middle[2]]) for y in heights]

@@ -33,7 +33,7 @@ from ._polygons import (
     make_material as make_material,
     make_texture as make_texture,
 )
-from ._raycast import cast_rays as cast_rays
+from ._raycast import cast_rays as cast_rays, cast_rays_within as cast_rays_within
 from ._rotation import (
     matrix_from_quaternion as matrix_from_quaternion,
     polar_rotation as polar_rotation,

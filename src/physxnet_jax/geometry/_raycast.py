@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import KDTree
 
 from ..typing import pytree
 from ._mesh import TriMesh
@@ -14,6 +15,10 @@ from ._topology import mesh_edges
 
 # Rays per chunk: [vertices, rays] blocks of a 13,000-vertex body then fit the cache.
 _CHUNK = 64
+# Rays of a block that share triangles, and the largest number of triangles of a call.
+_BLOCK, _MOST_FACES = 64, 400_000
+# What the boxes around rays are larger by, for rounding [m].
+_SLACK = 1e-5
 
 
 @pytree
@@ -93,6 +98,127 @@ def cast_rays(
         jnp.asarray(max_distance, dtype=mesh.vertices.dtype),
         both,
     )
+
+
+def cast_rays_within(
+    mesh: TriMesh,
+    origins: Float[np.ndarray, "rays 3"],
+    directions: Float[np.ndarray, "rays 3"],
+    reach: Float[np.ndarray, " rays"],
+) -> RayHits:
+    """Intersection of each ray with a mesh nearest to its origin, both ways, within a reach.
+
+    As `cast_rays` with ``both``, but each block of rays meets only the triangles that it can
+    reach: a garment's rays meet the skin beneath them, not the whole body. Runs on the host.
+
+    Args:
+        mesh: The mesh to intersect.
+        origins: Ray origins [m].
+        directions: Ray directions, any length.
+        reach: Maximum distance of each ray's hit [m].
+
+    Returns:
+        The nearest hits.
+    """
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    corners = vertices[faces]
+    middle = corners.mean(axis=1)
+    size = float(np.linalg.norm(corners - middle[:, None], axis=2).max())
+    tree, count = KDTree(middle), len(origins)
+    # Rays of one leaf of a tree lie beside each other.
+    order = KDTree(origins, leafsize=_BLOCK).indices
+    blocks = np.resize(order, -(-count // _BLOCK) * _BLOCK).reshape(-1, _BLOCK)
+    centre = origins[blocks].mean(axis=1)
+    radius = np.linalg.norm(origins[blocks] - centre[:, None], axis=2) + reach[blocks]
+    found = tree.query_ball_point(centre, radius.max(axis=1) + size)
+    # Of these, the triangles that touch the box around the rays.
+    unit = directions / np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-12)
+    along = (unit * (1.001 * reach + _SLACK)[:, None])[blocks]
+    low = (origins[blocks] - np.abs(along)).min(axis=1)
+    high = (origins[blocks] + np.abs(along)).max(axis=1)
+    least, most = corners.min(axis=1), corners.max(axis=1)
+    for k, n in enumerate(found):
+        n = np.asarray(n, np.int64)
+        touches = (least[n] <= high[k]).all(axis=1) & (most[n] >= low[k]).all(axis=1)
+        found[k] = n[touches]
+    # Powers of two and four, so that few programs are compiled.
+    width = np.array([1 << max((len(n) - 1).bit_length(), 8) for n in found])
+    turned = (np.roll(faces, -1, axis=1) > np.roll(faces, -2, axis=1))[:, :, None]
+    # The ends of each edge in the order of their numbers, as faces on both sides see it.
+    ends = np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2)
+    ends = np.where(turned[..., None], ends[:, :, ::-1], ends)
+    sign = np.where(turned[..., 0], -1.0, 1.0)
+    out = [np.zeros(count, np.int32), np.zeros((count, 3)), np.full(count, np.inf)]
+    for w in np.unique(width):
+        at = np.flatnonzero(width == w)
+        rows = np.zeros((len(at), w), np.int64)
+        for k, n in enumerate(at):
+            rows[k, : len(found[n])] = found[n]
+        for part in np.array_split(np.arange(len(at)), -(-len(at) * w // _MOST_FACES)):
+            calls = 4 ** ((len(part) - 1).bit_length() + 1 >> 1)
+            padded = part[np.minimum(np.arange(calls), len(part) - 1)]
+            b, r = blocks[at[padded]], rows[padded]
+            arrays = (corners[r], ends[r], sign[r], origins[b], directions[b], reach[b])
+            hits = _cast_blocks(*(jnp.asarray(a, jnp.float32) for a in arrays))
+            index, weights, distance = (np.asarray(h)[: len(part)] for h in hits)
+            ray = b[: len(part)].reshape(-1)
+            near = np.take_along_axis(r[: len(part)], index.astype(np.int64), axis=1)
+            for store, value in zip(out, (near, weights, distance), strict=True):
+                store[ray] = value.reshape(-1, *value.shape[2:])
+    valid = np.isfinite(out[2])
+    return RayHits(
+        jnp.asarray(np.where(valid, out[0], 0).astype(np.int32)),
+        jnp.asarray(out[1], jnp.float32),
+        jnp.asarray(out[2], jnp.float32),
+        jnp.asarray(valid),
+    )
+
+
+@jax.jit
+def _cast_blocks(
+    corners: Array, ends: Array, sign: Array, origins: Array, directions: Array, reach: Array
+) -> tuple[Array, Array, Array]:
+    """Nearest of its block's triangles that each ray hits: its row, weights and distance."""
+
+    def block(arrays: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+        corner, end, sign, origin, direction, reach = arrays
+        length = safe_norm(direction)
+        unit = direction / jnp.where(length > 0, length, 1.0)[:, None]
+        kz = jnp.argmax(jnp.abs(unit), axis=1)
+        axes = jnp.stack([(kz + 1) % 3, (kz + 2) % 3, kz], axis=1)
+        s = jnp.take_along_axis(unit, axes, axis=1)
+        dz = jnp.where(length > 0, s[:, 2], 1.0)
+        slope = (s / dz[:, None]).T[:, None, None]
+        # Shape [faces, 3, rays] and [faces, 3, 2, rays].
+        depth = _along(corner, origin, axes[:, 2]) / dz[None, None]
+        ex, ey, ez = (_along(end, origin, axes[:, k]) for k in range(3))
+        ex, ey = ex - slope[0][None] * ez, ey - slope[1][None] * ez
+        function = (ex[:, :, 0] * ey[:, :, 1] - ey[:, :, 0] * ex[:, :, 1]) * sign[..., None]
+        inside = (function >= 0).all(axis=1) | (function <= 0).all(axis=1)
+        det = function.sum(axis=1)
+        inside &= (det != 0) & (length > 0)[None]
+        inverse = 1.0 / jnp.where(det != 0, det, 1.0)
+        t = (function * depth).sum(axis=1) * inverse
+        away = jnp.where(inside & (jnp.abs(t) <= reach[None]), jnp.abs(t), jnp.inf)
+        best = jnp.argmin(away, axis=0)
+        lane = jnp.arange(len(origin))
+        hit = jnp.isfinite(away[best, lane])
+        weights = function[best, :, lane] * inverse[best, lane][:, None]
+        return (
+            best.astype(jnp.int32),
+            jnp.where(hit[:, None], weights, 0.0),
+            jnp.where(hit, t[best, lane], jnp.inf),
+        )
+
+    return jax.lax.map(block, (corners, ends, sign, origins, directions, reach))
+
+
+def _along(points: Array, origin: Array, axis: Array) -> Array:
+    """Coordinates of points relative to each ray's origin, along its axis; rays last."""
+    others = (1,) * (points.ndim - 1)
+    relative = [points[..., c, None] - origin[:, c].reshape(*others, -1) for c in range(3)]
+    axis = jnp.broadcast_to(axis.reshape(*others, -1), relative[0].shape)
+    return jnp.where(axis == 0, relative[0], jnp.where(axis == 1, relative[1], relative[2]))
 
 
 @jax.jit(static_argnames="both")

@@ -182,13 +182,13 @@ class GltfFile:
         return out
 
     def world(
-        self, times: Float[np.ndarray, " frames"] | None = None, animation: int = 0
+        self, times: Float[np.ndarray, " frames"] | None = None, animation: int | None = None
     ) -> Float[np.ndarray, "frames nodes 4 4"]:
         """World matrices of all nodes.
 
         Args:
             times: Times of the animation [s]; the static transforms of nodes if omitted.
-            animation: Index of the animation.
+            animation: Index of the animation; the longest by default.
         """
         tracks = {} if times is None else self._tracks(animation)
         at = np.zeros(1) if times is None else times
@@ -238,12 +238,12 @@ class GltfFile:
             raise self.broken(f"node {n} is too far away")
 
     def frame_times(
-        self, animation: int = 0, *, rate: float | None = None
+        self, animation: int | None = None, *, rate: float | None = None
     ) -> tuple[Float[np.ndarray, " frames"], float]:
         """Times of an animation's frames [s], and their rate.
 
         Args:
-            animation: Index of the animation.
+            animation: Index of the animation; the longest by default.
             rate: Frames per second. If omitted, the rate of the densest keys; morph targets
                 are then ignored.
         """
@@ -264,7 +264,7 @@ class GltfFile:
         return start + np.arange(int((end - start) * rate + 1e-3) + 1) / rate, rate
 
     def _single_time(
-        self, animation: int, rate: float | None
+        self, animation: int | None, rate: float | None
     ) -> tuple[Float[np.ndarray, " frames"], float]:
         """The time of a single key, or time 0 for a mesh that isn't animated."""
         keys = [
@@ -278,8 +278,36 @@ class GltfFile:
             )
         return np.array([float(keys[0][0]) if keys else 0.0]), rate or 30.0
 
-    def _tracks(self, animation: int) -> dict[tuple[int, str], _Track]:
+    def animation(self, name: str | None = None) -> int:
+        """Index of an animation by its name, or of the longest one.
+
+        Raises:
+            MotionError: No animation has this name.
+        """
+        names = self.animation_names()
+        if name is None:
+            return max(range(len(names)), key=self._duration, default=0)
+        if name not in names:
+            found = ", ".join(names)[:300] or "none"
+            raise MotionError.at(
+                self.path, None, f"no animation '{name}'; there are {found}", "Choose one of them"
+            )
+        return names.index(name)
+
+    def animation_names(self) -> list[str]:
+        """Names of the animations, in the file's order."""
+        return [str(a.name or k) for k, a in enumerate(self.document.animations or ())]
+
+    def _duration(self, animation: int) -> float:
+        keys = [times for times, _, _ in self._tracks(animation).values() if len(times)]
+        return max((float(k[-1]) for k in keys), default=0.0) - min(
+            (float(k[0]) for k in keys), default=0.0
+        )
+
+    def _tracks(self, animation: int | None) -> dict[tuple[int, str], _Track]:
         """Times, values and interpolation mode of an animation's tracks, cached."""
+        if animation is None:
+            animation = self.animation()
         if animation not in self._keys:
             self._keys[animation] = self._read_tracks(animation)
         return self._keys[animation]
@@ -323,7 +351,7 @@ class GltfFile:
         return out
 
     def morph_weights(
-        self, node: int, times: Float[np.ndarray, " frames"] | None, animation: int = 0
+        self, node: int, times: Float[np.ndarray, " frames"] | None, animation: int | None = None
     ) -> Float[np.ndarray, "frames targets"] | None:
         """Weights of a node's morph targets over time; None if it has none.
 

@@ -6,15 +6,16 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import MotionError, PhysXNetError
-from ..io import GltfFile, nearest_turns
+from ..io import GLTF_FORMATS, GltfFile, nearest_turns
 from ._source import SourceClip
 
 
-def read_gltf(path: str | pathlib.Path) -> SourceClip:
-    """Reads the first animation of a `.glb` or `.gltf` file, without retargeting.
+def read_gltf(path: str | pathlib.Path, animation: str | None = None) -> SourceClip:
+    """Reads an animation of a `.glb` or `.gltf` file, without retargeting.
 
     Args:
         path: The file.
+        animation: Name of the animation; the longest by default.
 
     Returns:
         World rotations and positions of the joints of the largest skin, or of every node
@@ -30,7 +31,7 @@ def read_gltf(path: str | pathlib.Path) -> SourceClip:
         Khronos, glTF 2.0, sections 3.7.3 (skins) and 3.11 (animations).
     """
     try:
-        return _read(pathlib.Path(path))
+        return _read(pathlib.Path(path), animation)
     except (PhysXNetError, OSError):
         raise
     # pygltflib doesn't check the types of the JSON's values.
@@ -43,11 +44,30 @@ def read_gltf(path: str | pathlib.Path) -> SourceClip:
         ) from error
 
 
-def _read(path: pathlib.Path) -> SourceClip:
+def _read(path: pathlib.Path, animation: str | None) -> SourceClip:
     file = GltfFile(path)
-    times, fps = file.frame_times()
-    nodes = skeleton_nodes(file)
-    return _clip(file, nodes, file.world(times)[:, nodes], fps)
+    chosen = file.animation(animation)
+    times, fps = file.frame_times(chosen)
+    nodes = skeleton_nodes(file, chosen)
+    return _clip(file, nodes, file.world(times, chosen)[:, nodes], fps)
+
+
+def split_animation(path: str | pathlib.Path) -> tuple[pathlib.Path, str | None]:
+    """Splits ``FILE#ANIMATION`` into the file and the animation's name, None without one."""
+    file, _, name = str(path).rpartition("#")
+    if file and pathlib.Path(file).suffix.lower() in GLTF_FORMATS:
+        return pathlib.Path(file), name
+    return pathlib.Path(path), None
+
+
+def other_animations(path: pathlib.Path) -> tuple[str, list[str]]:
+    """The animation of a file that is read by default, and the names of the others."""
+    file = GltfFile(path)
+    names = file.animation_names()
+    if len(names) < 2:
+        return "", []
+    chosen = names[file.animation()]
+    return chosen, [n for n in names if n != chosen]
 
 
 def read_rig(file: GltfFile) -> tuple[SourceClip, list[int]]:
@@ -88,17 +108,17 @@ def _clip(
     )
 
 
-def skeleton_nodes(file: GltfFile) -> list[int]:
+def skeleton_nodes(file: GltfFile, animation: int = 0) -> list[int]:
     """Joints of the largest skin and VRM bones, or all rotating nodes; parents first."""
     document = file.document
     if document.skins:
         most = max(document.skins, key=lambda skin: len(skin.joints))
         wanted = {file.index(j, document.nodes, "joint") for j in most.joints} | set(file.bones())
     else:
-        animation = document.animations[0] if document.animations else None
+        moving = document.animations[animation] if document.animations else None
         wanted = {
             file.index(c.target.node, document.nodes, "node")
-            for c in (animation.channels if animation else ())
+            for c in (moving.channels if moving else ())
             if c.target.path == "rotation" and c.target.node is not None
         }
     nodes = [n for n in file.order if n in wanted]

@@ -10,12 +10,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import Body, load_body
+from ..io import GLTF_FORMATS
 from ._faults import sudden_turns
+from ._gltf import other_animations, split_animation
 from ._load import fitted_motion, read_motion
 from ._motion import Motion, resample
 from ._procedural import CLIPS
-from ._reference import ALWAYS, mean_trunk, reference_pose, stands, upright
-from ._retarget import foot_heights, joint_index, leg_length
+from ._reference import ALWAYS, mean_trunk, reference_pose, upright
+from ._retarget import THROUGH, foot_heights, joint_index, leg_length
 from ._skeletons import find_joint_map, read_joint_map
 from ._source import SourceClip
 
@@ -130,6 +132,14 @@ def inspect_motion(
             "its trunk points along Z all the time: unless the person is lying, the frames were"
             " written with Z up and the rest pose with Y up; export it again."
         )
+    file, animation = split_animation(motion)
+    if animation is None and file.suffix.lower() in GLTF_FORMATS:
+        chosen, others = other_animations(file)
+        if others:
+            notes.append(
+                f"'{chosen}' is read, the longest of its animations; {motion}#NAME reads"
+                f" {', '.join(others)[:200]}."
+            )
     if left_out:
         notes.append(f"{', '.join(left_out)} follow their parents: the skeleton lacks them.")
     if found.added:
@@ -144,7 +154,7 @@ def inspect_motion(
         notes.append(
             f"{clip.fps:g} frames per second are resampled to 30; --fps sets another rate."
         )
-    out = f"{motion if str(motion) in CLIPS else pathlib.Path(motion).stem}.usdc"
+    out = f"{motion if str(motion) in CLIPS else file.stem}.usdc"
     words = ["physxnet", "dress", shlex.quote(str(motion)), *options]
     words += ["--wear", "shirt", "trousers", "-o", shlex.quote(out)]
     return MotionInspection(
@@ -229,11 +239,8 @@ def _trajectory(body: Body, clip: Motion, rest: Float[Array, "all 3"]) -> _Traje
             " wrong rate (--source-fps sets the true one)."
         )
     if feet > _MAX_FOOT_OFFSET:
-        notes.append(
-            f"its feet are {100 * feet:.0f} cm above the floor half of the time: the floor is"
-            " placed at the lowest frame."
-        )
-    if low < -_MAX_FOOT_OFFSET:
+        notes.append(f"its feet are {100 * feet:.0f} cm above the floor half of the time.")
+    if low < -THROUGH:
         frame = int(heights.argmin() * clip.fps / steady.fps)
         notes.append(f"a foot is {-100 * low:.0f} cm below the floor at frame {frame}.")
     if clip.num_frames < 2:
@@ -243,14 +250,8 @@ def _trajectory(body: Body, clip: Motion, rest: Float[Array, "all 3"]) -> _Traje
 
 
 def _reference(source: SourceClip, index: Mapping[str, int]) -> str:
-    may_have_t_pose = source.rest is None
     turned = upright(source, index)
-    _, start, _ = reference_pose(turned, index, may_have_t_pose)
-    if start:
-        return "the T-pose in its first frame, which is dropped"
-    if stands(turned, index, 1):
-        return "its rest pose" + (", turned upright" if turned is not source else "")
-    return "the frame in which the person stands straightest"
+    return reference_pose(turned, index, turned is not source).kind
 
 
 def _unit(

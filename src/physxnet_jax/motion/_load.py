@@ -15,7 +15,7 @@ from ..io import GLTF_FORMATS
 from ._amass import AMASS_ARRAYS, amass_clip
 from ._asf_amc import read_amc
 from ._bvh import read_bvh
-from ._gltf import read_gltf
+from ._gltf import read_gltf, split_animation
 from ._motion import Motion, make_motion, resample
 from ._procedural import CLIPS, procedural_clip
 from ._retarget import retarget, stand_on_floor
@@ -37,7 +37,8 @@ def load_motion(
 
     Args:
         motion: A file or the name of a built-in clip. Files are `.bvh`, `.amc` (with its
-            ASF), `.glb`, `.gltf` or `.vrma` with an animation, and `.npz` written by
+            ASF), `.glb`, `.gltf` or `.vrma` with an animation (the longest, or
+            ``file.glb#Run``), and `.npz` written by
             `save_motion` or from AMASS (SMPL, SMPL+H or SMPL-X poses).
         fps: Resample to this rate [1/s].
         source_fps: True rate of the file [1/s], if its header is wrong or has none (files
@@ -112,7 +113,7 @@ def read_motion(
     for name, rate in (("fps", fps), ("source_fps", source_fps)):
         if rate is not None and not (math.isfinite(rate) and rate > 0):
             raise MotionError(f"{name} is {rate}, expected a positive number.")
-    path = pathlib.Path(motion)
+    path, animation = split_animation(motion)
     suffix = path.suffix.lower()
     if skeleton is not None and suffix != ".amc":
         raise MotionError(f"{motion}: a skeleton (.asf) is for .amc files. Leave it out.")
@@ -121,7 +122,7 @@ def read_motion(
     elif suffix == ".amc":
         read = read_amc(path, skeleton)
     elif suffix in GLTF_FORMATS:
-        read = read_gltf(path)
+        read = read_gltf(path, animation)
     elif suffix == ".npz":
         read = _read_npz(path)
     elif str(motion) in CLIPS:

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +20,8 @@ SHORTEST, LONGEST = 1e-9, 1e9
 _STANDING = float(np.cos(np.radians(45.0)))
 # A mean trunk direction with a component above this points that way throughout the clip.
 ALWAYS = 0.8
+# A T-pose that isn't part of a motion is left within this time [s].
+_SOON = 0.25
 # DAZ figures hold their forearms 17 degrees forward in their T-pose.
 _T_POSE = float(np.cos(np.radians(25.0)))
 
@@ -54,20 +57,36 @@ def stands(source: SourceClip, index: Mapping[str, int], axis: int) -> bool:
     return bool(down > _STANDING and trunk[axis] > _STANDING * np.linalg.norm(trunk))
 
 
-def reference_pose(
-    source: SourceClip, index: Mapping[str, int], may_have_t_pose: bool
-) -> tuple[Float[np.ndarray, "bones 3 3"], int, Float[np.ndarray, "3 3"]]:
+class Reference(NamedTuple):
+    """The reference pose of a clip.
+
+    Attributes:
+        rotations: World rotations of the skeleton's joints, shape [bones, 3, 3].
+        start: First frame of motion: 1 if frame 0 is a T-pose.
+        stance: Orientation of the person's hips in it (columns left, up, forward).
+        twist: Turn of the line through the shoulders against that through the hips, about
+            the trunk [rad].
+        kind: Description.
+    """
+
+    rotations: Float[np.ndarray, "bones 3 3"]
+    start: int
+    stance: Float[np.ndarray, "3 3"]
+    twist: float
+    kind: str
+
+
+def reference_pose(source: SourceClip, index: Mapping[str, int], turned: bool = False) -> Reference:
     """Finds the reference pose of a clip.
 
     Args:
         source: The clip.
         index: Body joint to index of the clip's joint.
-        may_have_t_pose: Frame 0 may be a T-pose that isn't part of the motion, as in
-            formats that can't store a rest pose.
+        turned: Whether the skeleton was turned upright, for the description.
 
-    Returns:
-        Its world rotations, the first frame of motion, and the orientation of the person
-        in it (columns left, up, forward).
+    Note:
+        Frame 0 may be a T-pose that isn't part of the motion: always in formats that can't
+        store a rest pose, in others if the arms leave it within a quarter of a second.
     """
     first = source.rotations[0]
     limbs = {k: v for k, v in index.items() if k in LIMBS and LIMBS[k] in index}
@@ -75,19 +94,20 @@ def reference_pose(
     standing = stands(source, index, 1)
     stance = _heading(_pose_positions(source, rest), index) if standing else np.eye(3)
     upright = np.abs(first[index["Hips"]] - rest[index["Hips"]]).max() < 0.1
-    if may_have_t_pose and upright and len(source.root) > 1:
-        pointing = limb_directions(source, index, first)
-        sideways = [
-            (1.0 if k.startswith("Left") else -1.0) * float(pointing[k] @ stance[:, 0])
-            for k in limbs
-            if "Arm" in k
-        ]
-        down = [-pointing[k][1] for k in limbs if "Leg" in k]
-        if min(sideways + down) > _T_POSE:
-            return first, 1, stance
+    start = 0
+    if upright and len(source.root) > 1 and _is_t_pose(source, index, limbs, stance, 0):
+        if source.rest is None:
+            kind = "the T-pose in its first frame, which is dropped"
+            return Reference(first, 1, stance, 0.0, kind)
+        soon = min(int(np.ceil(_SOON * source.fps)), len(source.root) - 1)
+        start = int(not _is_t_pose(source, index, limbs, stance, soon))
+    dropped = "; the T-pose in its first frame is dropped" if start else ""
     if not standing:
         frame = _straightest(source, index)
-        return source.rotations[frame], 0, _stance(source, frame, index)
+        pose = source.rotations[frame]
+        twist = _twist(source.positions()[frame], index)
+        kind = "the frame in which the person stands straightest" + dropped
+        return Reference(pose, start, _stance(source, frame, index), twist, kind)
     # CMU's skeletons stand astride at rest: turn each leg as a whole to a vertical thigh.
     pose = rest.copy()
     pointing = limb_directions(source, index, pose)
@@ -99,7 +119,36 @@ def reference_pose(
                 member.add(j)
         for j in member:
             pose[j] = turn.as_matrix() @ pose[j]
-    return pose, 0, stance
+    kind = "its rest pose" + (", turned upright" if turned else "") + dropped
+    return Reference(pose, start, stance, 0.0, kind)
+
+
+def _is_t_pose(
+    source: SourceClip,
+    index: Mapping[str, int],
+    limbs: Mapping[str, int],
+    stance: Float[np.ndarray, "3 3"],
+    frame: int,
+) -> bool:
+    """Whether arms point sideways and legs down in a frame."""
+    pointing = limb_directions(source, index, source.rotations[frame])
+    sideways = [
+        (1.0 if k.startswith("Left") else -1.0) * float(pointing[k] @ stance[:, 0])
+        for k in limbs
+        if "Arm" in k
+    ]
+    down = [-pointing[k][1] for k in limbs if "Leg" in k]
+    return bool(min(sideways + down) > _T_POSE)
+
+
+def _twist(positions: Float[np.ndarray, "bones 3"], index: Mapping[str, int]) -> float:
+    """Turn of the shoulders' line against the hips', about the trunk [rad]."""
+    hips, arms = (
+        positions[index[f"Left{n}"]] - positions[index[f"Right{n}"]] for n in ("UpLeg", "Arm")
+    )
+    up = _trunk(positions, index)
+    up = up / max(np.linalg.norm(up), SHORTEST)
+    return float(np.arctan2(up @ np.cross(hips, arms), hips @ arms - (hips @ up) * (arms @ up)))
 
 
 def _heading(

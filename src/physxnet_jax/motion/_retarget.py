@@ -17,6 +17,8 @@ from ._source import SourceClip
 # Longest blend from a T-pose at a clip's start [s], and how much faster it turns than the 95th
 # percentile of the clip (factor).
 _MAX_BLEND, _BLEND_SPEED = 0.25, 1.5
+# Share of frames that may go through the floor [1], by more than this [m].
+_ODD_FRAMES, THROUGH = 0.05, 0.03
 
 
 def retarget(
@@ -54,16 +56,15 @@ def retarget(
     """
     body = load_body() if body is None else body
     index = joint_index(source, body, joint_map)
-    may_have_t_pose = source.rest is None
     source = upright(source, index)
-    reference, start, stance = reference_pose(source, index, may_have_t_pose)
+    reference, start, stance, twist, _ = reference_pose(source, index)
     if start >= len(source.root):
         raise MotionError.at(
             source.path, None, "only a T-pose frame, no motion", "Export more frames"
         )
     directions = limb_directions(source, index, reference)
     aligned = align_global(body, {k: stance.T @ d for k, d in directions.items()}, shape)
-    aligned = [Rotation.from_matrix(stance) * a for a in aligned]
+    aligned = _twisted(body, [Rotation.from_matrix(stance) * a for a in aligned], stance, twist)
     world = _world_rotations(body, source, index, reference, aligned, start)
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     heads = np.asarray(body.joint_positions(rest)[0], dtype=np.float64)
@@ -94,6 +95,27 @@ def retarget(
         quaternions, root = _without_t_pose_blend(quaternions, root, source.fps)
     motion = make_motion(quaternions, root, source.fps, name=source.name)
     return stand_on_floor(body, motion, rest)
+
+
+def _twisted(
+    body: Body, aligned: list[Rotation], stance: Float[np.ndarray, "3 3"], twist: float
+) -> list[Rotation]:
+    """Spreads the twist of the reference pose over the trunk, up to the shoulders.
+
+    Arms and legs keep the directions that they were given.
+    """
+    if twist == 0.0:
+        return aligned
+    spine = ("LowerBack", "Spine", "Spine1")
+    share = {name: (k + 1) / len(spine) for k, name in enumerate(spine)}
+    out = list(aligned)
+    shares = np.zeros(len(out))
+    for j, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
+        shares[j] = share.get(name, shares[parent] if parent >= 0 else 0.0)
+        free = not name.startswith(("LeftArm", "RightArm", "LeftFore", "RightFore"))
+        if shares[j] and free:
+            out[j] = Rotation.from_rotvec(shares[j] * twist * stance[:, 1]) * aligned[j]
+    return out
 
 
 def _without_t_pose_blend(
@@ -164,8 +186,13 @@ def leg_length(positions: Float[np.ndarray, "joints 3"], place: Callable[[str], 
 
 
 def stand_on_floor(body: Body, motion: Motion, rest: Float[Array, "all 3"]) -> Motion:
-    """Moves the whole clip vertically so that its lowest foot vertex is at y=0."""
-    low = float(foot_heights(body, motion, rest).min())
+    """Moves the whole clip vertically so that its lowest foot vertex is at y=0.
+
+    Odd frames in which a foot goes through the floor don't count.
+    """
+    heights = foot_heights(body, motion, rest)
+    low, usual = float(heights.min()), float(np.quantile(heights, _ODD_FRAMES))
+    low = usual if usual - low > THROUGH else low
     root = np.asarray(motion.root) - np.array([[0.0, low, 0.0]], np.float32)
     return Motion(motion.rotations, jnp.asarray(root), motion.fps, motion.name)
 

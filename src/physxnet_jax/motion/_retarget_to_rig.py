@@ -44,7 +44,7 @@ def retarget_to_rig(
     rig, nodes = read_rig(file)
     index = joint_index(rig, body, joint_map)
     rig = upright(rig, index)
-    reference, _, stance = reference_pose(rig, index, False)
+    reference, _, stance, _, _ = reference_pose(rig, index)
     directions = limb_directions(rig, index, reference)
     aligned = align_global(body, {k: stance.T @ d for k, d in directions.items()})
     rest = body.rest_vertices(body.default_shape())

@@ -1,6 +1,7 @@
 """Joint names: known families of skeletons, and custom joint maps."""
 
 import pathlib
+import re
 import tomllib
 
 from ..body import load_body
@@ -12,6 +13,7 @@ _TRUNK = ("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Neck1", "Head")
 _ARM = ("Shoulder", "Arm", "ForeArm", "Hand")
 _LEG = ("UpLeg", "Leg", "Foot", "ToeBase")
 _MARKS = str.maketrans("", "", " _.-")
+_SIDE_BEHIND = re.compile(r"^(?P<rest>.*[a-z0-9])[ _.-](?P<side>l|r|left|right)$", re.IGNORECASE)
 
 
 def _family(
@@ -171,7 +173,7 @@ def find_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
 
 def nearest_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
     """The family that fits the skeleton best, and the joints of it that the skeleton has."""
-    have = {_plain(name): name for name in reversed(source.names)}
+    have = {plain: name for name in reversed(source.names) for plain in _spellings(name)}
     found: dict[str, dict[str, str]] = {}
     for family, joints in JOINT_MAPS.items():
         plain = {b: _plain(s) for b, s in joints.items()}
@@ -187,6 +189,19 @@ def nearest_joint_map(source: SourceClip) -> tuple[str, dict[str, str]]:
     }
     family = min(missing, key=lambda f: (len(NEEDED - found.get(f, {}).keys()), len(missing[f])))
     return family, found.get(family, {})
+
+
+def _spellings(name: str) -> list[str]:
+    """A name without marks, and with a side that stands behind it moved to the front."""
+    found = _SIDE_BEHIND.match(name)
+    if found is None:
+        return [_plain(name)]
+    rest, side = _plain(found["rest"]), found["side"].lower()
+    # Some families put whole sides in front, others letters; a prefix stays before both.
+    head, _, tail = found["rest"].rpartition(":")
+    sides = (side[0], "left" if side[0] == "l" else "right")
+    turned = (_plain(head) + s + _plain(tail) for s in sides)
+    return [*(rest + s for s in sides), *turned]
 
 
 def _plain(name: str) -> str:

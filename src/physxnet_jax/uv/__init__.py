@@ -1,7 +1,12 @@
 """UV maps: the atlas, transference matrices, binding, body and garment maps."""
 
 from ._atlas import Atlas as Atlas, make_atlas as make_atlas
-from ._bind import Binding as Binding, bind as bind, garment_map_rows as garment_map_rows
+from ._bind import (
+    Binding as Binding,
+    bind as bind,
+    garment_map_rows as garment_map_rows,
+    hit_rate as hit_rate,
+)
 from ._conditions import CONDITIONS as CONDITIONS, condition_maps as condition_maps
 from ._dress_body import dress_body as dress_body
 from ._maps import (

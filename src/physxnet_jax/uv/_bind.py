@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -9,7 +10,15 @@ from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..garment import Garment, Template, template
-from ..geometry import TriMesh, cast_rays, closest_points, padded_rows, vertex_normals
+from ..geometry import (
+    TriMesh,
+    cast_rays,
+    cast_rays_within,
+    closest_among,
+    nearby_faces,
+    padded_rows,
+    vertex_normals,
+)
 from ..typing import pytree
 from ._atlas import Atlas, make_atlas
 from ._dress_body import dress_body
@@ -20,6 +29,8 @@ from ._transference import Transference
 _MAX_DISTANCE: dict[Template, float] = {"top": 0.08, "bottom": 0.08, "dress": 0.30}
 # A ray hit more than this many times as far as the closest point lies on another limb.
 _MAX_DISTANCE_RATIO = 2.0
+
+_closest_among = jax.jit(closest_among)
 
 
 @pytree
@@ -163,19 +174,7 @@ def bind(
     if valid is None:
         valid = garment_map_rows(atlas, body, rest, template(garment.template)).valid
     mesh = chart_mesh(atlas, body, rest, garment.template)
-    normals = vertex_normals(garment.mesh.vertices, garment.mesh.faces)
-    count = len(normals)
-    points, normals = (
-        jnp.asarray(padded_rows(np.asarray(x))) for x in (garment.mesh.vertices, normals)
-    )
-    hits = cast_rays(mesh, points, normals, both=True, max_distance=_MAX_DISTANCE[garment.template])
-    near = closest_points(mesh, points)
-    # NumPy on the host from here, so that nothing has to be compiled.
-    reach = np.where(np.asarray(hits.valid), np.abs(np.asarray(hits.distance)), np.inf)
-    good = reach <= _MAX_DISTANCE_RATIO * np.sqrt(np.asarray(near.squared_distance)) + 0.01
-    face = np.where(good, np.asarray(hits.face), np.asarray(near.face))
-    weights = np.where(good[:, None], np.asarray(hits.weights), np.asarray(near.weights))
-    good, face, weights = good[:count], face[:count], weights[:count]
+    good, face, weights = _hits(mesh, garment, np.arange(garment.num_vertices))
     uv = np.einsum("vk,vkc->vc", weights, np.asarray(mesh.uv)[np.asarray(mesh.uv_faces)[face]])
     texel, weight, off = sampling_weights(atlas, uv, np.asarray(valid), mesh, face, weights)
     if atlas.skirt is not None and garment.template == "dress":
@@ -201,6 +200,49 @@ def bind(
         jnp.asarray(np.int32(np.sum(~good))),
         jnp.asarray(np.int32(off.sum())),
     )
+
+
+def hit_rate(
+    garment: Garment, *, body: Body, rest: Float[Array, "all 3"], most: int = 4000
+) -> float:
+    """Share of a garment's vertices whose ray meets the body, as `bind` finds it [1].
+
+    Args:
+        garment: Any garment on the body.
+        body: The body.
+        rest: Its rest vertices [m].
+        most: Largest number of vertices that are looked at.
+    """
+    mesh = chart_mesh(make_atlas(32, body=body), body, rest, garment.template)
+    rows = np.unique(np.linspace(0, garment.num_vertices - 1, most).astype(int))
+    return float(np.mean(_hits(mesh, garment, rows)[0]))
+
+
+def _hits(
+    mesh: TriMesh, garment: Garment, rows: Int[np.ndarray, " rows"]
+) -> tuple[Bool[np.ndarray, " rows"], Int[np.ndarray, " rows"], Float[np.ndarray, "rows 3"]]:
+    """Which vertices' rays meet the skin, and the face and weights of the hit or closest point."""
+    normals = np.asarray(vertex_normals(garment.mesh.vertices, garment.mesh.faces))[rows]
+    points = np.asarray(garment.mesh.vertices)[rows]
+    face, weights, squared = _closest(mesh, points)
+    reach = _MAX_DISTANCE_RATIO * np.sqrt(squared) + 0.01
+    reach = np.minimum(reach, _MAX_DISTANCE[garment.template])
+    hits = cast_rays_within(mesh, points, normals, reach)
+    good = np.array(hits.valid)
+    face = np.where(good, np.asarray(hits.face), face)
+    return good, face, np.where(good[:, None], np.asarray(hits.weights), weights)
+
+
+def _closest(
+    mesh: TriMesh, points: Float[np.ndarray, "points 3"]
+) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Float[np.ndarray, " points"]]:
+    """Closest face of each point, its weights there and the squared distance [m^2]."""
+    near = nearby_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces), points, neighbours=12)
+    padded = jnp.asarray(padded_rows(points)), jnp.asarray(padded_rows(near))
+    found = _closest_among(mesh, *padded)
+    parts = (found.face, found.weights, found.squared_distance)
+    face, weights, squared = (np.asarray(x)[: len(points)] for x in parts)
+    return face, weights, squared
 
 
 def sampling_weights(
