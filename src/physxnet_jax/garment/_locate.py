@@ -24,7 +24,7 @@ from ..io import StaticMesh
 from ._garment import carried_weights
 from ._openings import Opening
 from ._poses import PosedBody, posed_bodies
-from ._search import FRAMES, UNITS, Placed, Search, choose, plausible_units, turns
+from ._search import FRAMES, UNITS, Candidate, Search, choose, plausible_units, turns
 
 # Cost above which a garment is refused if nothing holds it where its file has it [m].
 _MAX_COST = 0.09
@@ -121,7 +121,7 @@ def locate_on_body(
 
 
 def placement_of(
-    search: Search, found: Placed, mesh: StaticMesh, body: Body, notes: Sequence[str] = ()
+    search: Search, found: Candidate, mesh: StaticMesh, body: Body, notes: Sequence[str] = ()
 ) -> Placement:
     """The placement of a mesh on the body at rest, from its place on a posed body."""
     v = found.apply(search.vertices)
@@ -143,14 +143,14 @@ def _given(unit: str | float, size: float) -> dict[str, float]:
     return {name: scale} if _SMALLEST < size * scale < _LARGEST else {}
 
 
-def _stands(found: Placed, hints: Hints) -> bool:
+def _stands(found: Candidate, hints: Hints) -> bool:
     """Whether a garment is near enough to the body, or held by it as a cape is."""
     as_is = found.frame == "origin" and (found.turn.up == "Y" or hints.up is not None)
     limit = _MAX_COST if hints == NO_HINTS else 2.0 * _MAX_COST
     return found.cost < limit or (found.held and as_is)
 
 
-def _notes(found: Placed) -> list[str]:
+def _notes(found: Candidate) -> list[str]:
     """Sentences on how a garment was placed."""
     out = []
     if found.turn.degrees:
@@ -173,7 +173,7 @@ def _notes(found: Placed) -> list[str]:
     return out
 
 
-def _refusal(path: pathlib.Path, mesh: StaticMesh, found: Placed | None, panels: int) -> str:
+def _refusal(path: pathlib.Path, mesh: StaticMesh, found: Candidate | None, panels: int) -> str:
     size = " x ".join(f"{s:.3g}" for s in np.ptp(mesh.vertices, axis=0))
     if panels:
         return (

@@ -62,7 +62,7 @@ class Turn(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class Placed:
+class Candidate:
     """A place of a garment on a posed body, and the evidence for it.
 
     Attributes:
@@ -186,7 +186,7 @@ class Search:
 
     def judge(
         self, unit: str, scale: float, turn: Turn, pose: str, shift: np.ndarray, frame: str
-    ) -> Placed:
+    ) -> Candidate:
         """Evaluates a candidate in full."""
         posed = self.poses[pose]
 
@@ -201,7 +201,7 @@ class Search:
         if frame == "found" and self.region is None:
             known = [0.0, self.floor, *FRAMES.values()]
             cost += _MOVED * min(abs(shift[1] - y) for y in known) + _MOVED * abs(shift[0])
-        return Placed(
+        return Candidate(
             cost=float(cost),
             misfit=fit,
             unit=unit,
@@ -241,7 +241,7 @@ class Search:
 
     def known(
         self, units: dict[str, float], turned: Iterable[Turn], poses: Iterable[str]
-    ) -> list[Placed]:
+    ) -> list[Candidate]:
         """Candidates in the frames of known bodies: their origin, or the floor under them."""
         shifts = {"origin": 0.0, "floor": self.floor, **FRAMES}
         coarse = []
@@ -260,7 +260,7 @@ class Search:
         chosen = {id(c): c for c in (*plain, *coarse[:_BEST])}.values()
         return sorted((self.judge(*c[1:]) for c in chosen), key=lambda p: p.cost)
 
-    def found(self, units: dict[str, float], turned: Iterable[Turn]) -> list[Placed]:
+    def found(self, units: dict[str, float], turned: Iterable[Turn]) -> list[Candidate]:
         """Candidates at any height, refined."""
         coarse, turned = [], list(turned)
         grid = _GRID if len(turned) * len(units) < 8 else 2.0 * _GRID
@@ -347,7 +347,7 @@ def _distinct(candidates: list[tuple]) -> list[tuple]:
     return out
 
 
-def choose(search: Search, units: dict[str, float], turned: list[Turn]) -> Placed | None:
+def choose(search: Search, units: dict[str, float], turned: list[Turn]) -> Candidate | None:
     """The place that the evidence speaks for; None if there is no unit to try.
 
     Frames of known bodies are preferred to places that fit slightly better.
