@@ -8,8 +8,15 @@ import numpy as np
 import pytest
 
 from physxnet_jax.body import load_body
-from physxnet_jax.errors import MeshError, PhysXNetError
-from physxnet_jax.garment import Hints, align_to_template, load_garment, tailor, template
+from physxnet_jax.errors import FormatError, MeshError, PhysXNetError
+from physxnet_jax.garment import (
+    Hints,
+    align_to_template,
+    load_garment,
+    load_outfit,
+    tailor,
+    template,
+)
 from physxnet_jax.garment._locate import NO_HINTS, locate_on_body
 from physxnet_jax.garment._openings import openings
 from physxnet_jax.garment._poses import POSES, posed_bodies
@@ -255,3 +262,41 @@ def test_limbs_pass_through_rings_about_them():
             assert around.limbs == (limb,)
             (beside,) = openings(middle + ring + 0.5 * side, loops, posed.limbs)
             assert limb not in beside.limbs
+
+
+def outfit(path, **meshes):
+    """An OBJ of several objects: vertices and triangles by name."""
+    lines, first = [], 1
+    for name, (x, faces) in meshes.items():
+        lines += [f"o {name}", *(f"v {a} {b} {c}" for a, b, c in x)]
+        lines += ["f " + " ".join(str(k + first) for k in f) for f in faces]
+        first += len(x)
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.release
+def test_outfits_are_split_and_their_buttons_ride_along(tmp_path, wardrobe):
+    """A shirt with a button and trousers, displaced together; the control: a shirt in two parts."""
+    shirt, trousers = (
+        (np.asarray(wardrobe[k].mesh.vertices, float), np.asarray(wardrobe[k].mesh.faces))
+        for k in ("tee", "trousers")
+    )
+    front = shirt[0][np.argmax(shirt[0][:, 2])]
+    button = front + 0.01 * np.array([[0, 0, 0.5], [1, 0, 0.5], [0, 1, 0.5]]), np.array([[0, 1, 2]])
+    moved = {
+        name: (100 * (x + [0.0, -FLOOR, 0.0]), f)
+        for name, (x, f) in {"tee": shirt, "button": button, "jeans": trousers}.items()
+    }
+    found = load_outfit(outfit(tmp_path / "a.obj", **moved))
+    assert [g.template for g, _ in found] == ["bottom", "top"]
+    assert found[0][0].num_vertices == len(trousers[0])
+    assert found[1][0].num_vertices == len(shirt[0]) + 3
+    assert np.abs(np.asarray(found[0][0].mesh.vertices) - trousers[0]).max() < 0.01
+    named = load_garment(f"{tmp_path / 'a.obj'}#button+tee")[0]
+    assert named.num_vertices == len(shirt[0]) + 3
+    left = (shirt[0][shirt[1], 0] > 0).all(axis=1)
+    halves = {"left": (shirt[0], shirt[1][left]), "right": (shirt[0], shirt[1][~left])}
+    assert len(load_outfit(outfit(tmp_path / "b.obj", **halves))) == 1
+    with pytest.raises(FormatError, match="no mesh 'hat'"):
+        load_garment(f"{tmp_path / 'a.obj'}#hat")

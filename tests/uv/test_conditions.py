@@ -83,3 +83,21 @@ def test_a_coarse_mesh_is_seen_as_a_fine_one(seen):
 def test_garments_without_borders_and_of_templates_are_described(seen):
     for name in ("top", "bottom", "dress"):
         assert seen(template(name))["covered"].sum() > 300
+
+
+def test_fabrics_beyond_those_learned_are_seen_as_the_nearest(body):
+    """Denim is stiffer and heavier than anything learned; the control: silk is seen as it is."""
+    atlas = make_atlas(64, skirt=True)
+    rest = body.rest_vertices(body.default_shape())
+    learned = ("cotton", "jersey", "silk")
+
+    def row(fabric, fabrics=None):
+        garment = tailor("tee", fabric=fabric)
+        binding = bind(garment, atlas=atlas, valid=jnp.ones(atlas.num_texels, bool))
+        maps = np.asarray(condition_maps(atlas, body, rest, garment, binding, fabrics))
+        return maps[maps[..., 0] > 0][0, 4:]
+
+    known = np.stack([row(f) for f in learned])
+    assert (row("denim") > known.max(axis=0) + 0.05).all()
+    np.testing.assert_allclose(row("denim", learned), known.max(axis=0), atol=1e-6)
+    np.testing.assert_array_equal(row("silk", learned), row("silk"))

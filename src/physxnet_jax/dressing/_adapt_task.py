@@ -149,7 +149,9 @@ def make_task(
     conditions = None
     if predictor.config.conditions:
         base = body.rest_vertices(body.default_shape())
-        conditions = condition_maps(predictor.atlas, body, base, worn, bound.binding)
+        conditions = condition_maps(
+            predictor.atlas, body, base, worn, bound.binding, predictor.config.fabrics
+        )
     vertices, faces = np.asarray(worn.mesh.vertices), np.asarray(worn.mesh.faces)
     index, share = pad_rows(patch_shares(vertices, faces, _PATCH).T.tocsr())
     learns, others = nnx.split_state(predictor.state, _decoder_of(worn.template), ...)

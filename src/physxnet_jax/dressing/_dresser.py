@@ -233,5 +233,5 @@ def bind_to_predictor(
     worn = bind_garment(body, rest, garment, binding, smooth=not config.skirt_chart)
     if not config.conditions:
         return worn
-    conditions = condition_maps(atlas, body, base, garment, binding)
+    conditions = condition_maps(atlas, body, base, garment, binding, config.fabrics)
     return dataclasses.replace(worn, modulation=predictor.modulation(garment.template, conditions))

@@ -337,7 +337,8 @@ def _report_parts(found: _Findings, path: pathlib.Path, raw: StaticMesh, body: B
     if len(set(kinds.values())) > 1:
         description = ", ".join(f"{name} is dressed by {kind}" for name, kind in kinds.items())
         found.problems.append(
-            f"it contains several garments, which are worn separately: {description}."
+            f"it contains several garments: {description}. `dress` wears each; inspect them"
+            " separately."
         )
         return f"physxnet inspect {' '.join(shlex.quote(f'{path}#{name}') for name in kinds)}"
     found.notes.append(

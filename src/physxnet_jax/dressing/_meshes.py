@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from ..body import Body
 from ..errors import PhysXNetError
-from ..garment import Garment, load_garment
+from ..garment import Garment, load_outfit
 from ..io import AnimatedMesh
 from ..motion import Motion, body_animation
 
@@ -85,16 +85,20 @@ def resolve_garments(
     wear = [wear] if isinstance(wear, str | pathlib.Path | Garment) else wear
     for word in wear:
         if isinstance(word, Garment):
-            garment = word
+            loaded = [word]
         else:
-            garment, found = load_garment(word, body=body, shape=shape)
-            if found.warning is not None:
-                notes.append(found.warning)
-        name, count = garment.name, 2
-        while name in taken:
-            name, count = f"{garment.name}_{count}", count + 1
-        taken.add(name)
-        garments.append(dataclasses.replace(garment, name=name))
+            found = load_outfit(word, body=body, shape=shape)
+            loaded = [garment for garment, _ in found]
+            notes += [report.warning for _, report in found if report.warning is not None]
+            if len(found) > 1:
+                names = ", ".join(f"{g.name} ({g.template})" for g in loaded)
+                notes.append(f"{word}: holds {len(found)} garments, worn in layers: {names}.")
+        for garment in loaded:
+            name, count = garment.name, 2
+            while name in taken:
+                name, count = f"{garment.name}_{count}", count + 1
+            taken.add(name)
+            garments.append(dataclasses.replace(garment, name=name))
     if not garments:
         raise PhysXNetError("Nothing to wear: name at least one garment.")
     return garments, tuple(notes)

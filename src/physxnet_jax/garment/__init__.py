@@ -21,6 +21,7 @@ from ._load import (
     guess_template as guess_template,
     hangs_off as hangs_off,
     load_garment as load_garment,
+    load_outfit as load_outfit,
     place_mesh as place_mesh,
 )
 from ._locate import (

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from scipy.spatial import KDTree
 
 from ..body import Body, load_body
 from ..errors import MeshError, PhysXNetError
@@ -24,12 +25,15 @@ from ..io import GARMENT_FORMATS, StaticMesh, mesh_name, read_mesh, split_part
 from ._fit import clearance, lift_out
 from ._garment import COTTON, TEMPLATES, Garment, Template
 from ._locate import Hints, Placement, locate_on_body, nearest_skin
-from ._openings import Opening
+from ._openings import Opening, openings
+from ._poses import posed_bodies
 from ._templates import template
 from ._wear import WearItem, parse_wear, with_fabric
 from .tailoring import KINDS, tailor
 
 NEAREST = 0.003
+# Largest number of meshes of a file that are looked at one by one.
+_MAX_PARTS = 40
 # Share of vertices inside the body above which a garment may be misplaced [1].
 ELSEWHERE = 0.1
 # Largest distance of the highest tenth from the skin, and longest edge, without a warning [m].
@@ -129,6 +133,79 @@ def load_garment(
         return _tailored(item, shape)
     garment, report = _load(item, body)
     return garment if item.fabric is None else with_fabric(garment, item.fabric), report
+
+
+def load_outfit(
+    path: str | pathlib.Path,
+    *,
+    body: Body | None = None,
+    shape: Float[Array, " shapes"] | None = None,
+) -> list[tuple[Garment, GarmentReport]]:
+    """Loads a garment as `load_garment` does, or each garment of a file that holds several.
+
+    Meshes of a file that limbs pass through by themselves, and that different templates dress,
+    are garments; others (buttons, ribbons, a pocket) belong to the garment nearest to them. All
+    keep their places relative to each other.
+
+    Args:
+        path: As for `load_garment`.
+        body: The body; the built-in one by default.
+        shape: Shape parameters of the person that tailored garments are cut for.
+
+    Raises:
+        MeshError: No unit and up axis places the meshes on the body.
+        FormatError: The file can't be read.
+    """
+    body = load_body() if body is None else body
+    item = parse_wear(path)
+    file, part = split_part(item.name)
+    single = item.name in KINDS or item.name in TEMPLATES or part is not None
+    if single or item.template is not None or file.suffix.lower() not in GARMENT_FORMATS:
+        return [load_garment(path, body=body, shape=shape)]
+    raw = read_mesh(file)
+    if len(raw.parts) < 2:
+        return [load_garment(path, body=body, shape=shape)]
+    placement = place_mesh(item, raw, body)
+    groups = _garments(file, raw, placement, body)
+    out = []
+    for names in groups or [None]:
+        name = item.name if names is None else f"{item.name}#{'+'.join(names)}"
+        mesh = raw if names is None else read_mesh(name)
+        there = placement if names is None else _part(raw, placement, mesh, body)
+        garment, report = garment_of(name, mesh, there, None, body)
+        out.append((garment if item.fabric is None else with_fabric(garment, item.fabric), report))
+    return out
+
+
+def _garments(
+    file: pathlib.Path, raw: StaticMesh, placement: Placement, body: Body
+) -> list[list[str]]:
+    """Names of the meshes of each garment of a file; none if it holds one."""
+    meshes = {name: read_mesh(f"{file}#{name}") for name in raw.parts[:_MAX_PARTS]}
+    parts = {name: _part(raw, placement, mesh, body) for name, mesh in meshes.items()}
+    worn = {
+        name: guess_template(part.vertices, meshes[name].faces)
+        for name, part in parts.items()
+        if sum(bool(o.limbs) for o in part.openings) >= 2
+    }
+    kinds = sorted(set(worn.values()))
+    if len(kinds) < 2:
+        return []
+    trees = {name: KDTree(parts[name].vertices) for name in worn}
+    groups: dict[str, list[str]] = {kind: [] for kind in kinds}
+    for name, part in parts.items():
+        near = min(trees, key=lambda n: float(np.mean(trees[n].query(part.vertices)[0])))
+        groups[worn.get(name) or worn[near]].append(name)
+    return list(groups.values())
+
+
+def _part(raw: StaticMesh, placement: Placement, part: StaticMesh, body: Body) -> Placement:
+    """The placement of a part of a mesh that was placed as a whole."""
+    rows = KDTree(raw.vertices).query(part.vertices)[1]
+    v = placement.vertices[rows]
+    limbs = posed_bodies(body)["rest"].limbs
+    found = openings(v, boundary_loops(part.faces), limbs)
+    return placement._replace(vertices=v, openings=tuple(found))
 
 
 def _tailored(

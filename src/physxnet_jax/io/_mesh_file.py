@@ -31,7 +31,7 @@ def read_mesh(path: str | pathlib.Path) -> StaticMesh:
 
     Rigged meshes of glTF and USD are read in their bind pose, animated ones at their start.
     Vertices that these formats and STL duplicate at seams are merged. Several meshes are
-    joined, but ``coat.glb#sleeves`` reads the mesh ``sleeves`` alone.
+    joined, but ``coat.glb#sleeves`` reads the mesh ``sleeves`` alone, ``#a+b`` two of them.
 
     Args:
         path: An ``.obj``, ``.glb``, ``.gltf``, ``.usd``, ``.usda``, ``.usdc``, ``.ply`` or

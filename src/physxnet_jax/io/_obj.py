@@ -13,6 +13,7 @@ from ..errors import FormatError
 from ..files import atomic_write, is_file
 from ..geometry import Material, Polygons, Texture, make_material
 from ._animated_mesh import StaticMesh
+from ._source_mesh import chosen_names
 from ._texture import texture_beside, write_textures
 from ._uv_transform import UvTransform, make_uv_transform, transform_uvs
 
@@ -32,8 +33,8 @@ def read_obj(path: str | pathlib.Path, part: str | None = None) -> StaticMesh:
 
     Args:
         path: The file.
-        part: Name of the object to read, or of the group in a file without objects; all
-            of them if omitted.
+        part: Name of the object to read, or of the group in a file without objects, or
+            several joined by ``+``; all of them if omitted.
 
     Returns:
         The mesh; vertex order is kept. Polygons keep the names of their materials, and the
@@ -66,8 +67,9 @@ def read_obj(path: str | pathlib.Path, part: str | None = None) -> StaticMesh:
     owner = parsed.objects if any(parsed.objects) else parsed.groups
     parts = tuple(sorted({name for name in owner if name}))
     if part is not None:
-        selected = np.asarray([name == part for name in owner])
-        if not selected.any():
+        wanted = chosen_names(part, parts)
+        selected = np.asarray([name in wanted for name in owner])
+        if wanted - set(parts):
             there = ", ".join(parts)[:300] or "one mesh without a name"
             raise FormatError(f"{path}: no mesh '{part}'; there is {there}.")
         corners, counts, material = (
@@ -78,7 +80,7 @@ def read_obj(path: str | pathlib.Path, part: str | None = None) -> StaticMesh:
         # Vertices of other parts are dropped; the order is kept.
         kept, at = np.unique(corners[:, 0], return_inverse=True)
         v, corners = v[kept], np.column_stack([at.reshape(-1), corners[:, 1]])
-        parts = (part,)
+        parts = tuple(sorted(wanted))
     table = corners[_split(counts, v[corners[:, 0]])]
     has_uv = len(uv) > 0 and bool((corners[:, 1] >= 0).all())
     looks = _looks(path, parsed.libraries)

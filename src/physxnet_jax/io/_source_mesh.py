@@ -2,7 +2,7 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -49,18 +49,24 @@ class SourceMesh:
         )
 
 
+def chosen_names(name: str, have: Collection[str]) -> set[str]:
+    """Names of the meshes that ``a+b`` selects; a mesh may itself be called so."""
+    return {name} if name in have else set(name.split("+"))
+
+
 def named(
     path: pathlib.Path, parts: Sequence[SourceMesh], name: str | None, advice: str
 ) -> Sequence[SourceMesh]:
-    """The meshes of this name, or all if it is None.
+    """The meshes of this name (``a+b`` for two), or all if it is None.
 
     Raises:
         FormatError: No mesh has this name.
     """
     if name is None:
         return parts
-    chosen = [p for p in parts if p.name == name]
-    if not chosen:
+    wanted = chosen_names(name, {p.name for p in parts})
+    chosen = [p for p in parts if p.name in wanted]
+    if wanted - {p.name for p in chosen}:
         names = ", ".join(sorted({p.name for p in parts}))[:300]
         raise FormatError(f"{path}: no mesh '{name}'; there are {names}. {advice}.")
     return chosen

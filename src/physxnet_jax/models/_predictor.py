@@ -35,6 +35,8 @@ class ModelConfig:
             are sampled as they are; others are smoothed over the cloth.
         finer: Whether the maps of offsets have twice the resolution of the maps of motion.
         conditions: Whether the network sees the garment, see `condition_maps`.
+        fabrics: Fabrics that it learns from. It sees stiffer or heavier ones, which would lead it
+            far astray, as the nearest of these.
     """
 
     inputs: FeatureConfig = dataclasses.field(default_factory=FeatureConfig)
@@ -44,6 +46,7 @@ class ModelConfig:
     skirt_chart: bool = False
     finer: bool = False
     conditions: bool = False
+    fabrics: tuple[str, ...] = ("cotton", "jersey", "silk")
 
     def __post_init__(self) -> None:
         if self.skirt_chart and self.family == "paper":

@@ -164,9 +164,8 @@ def load_predictor(
 
 
 def _model(card: dict[str, Any]) -> ModelConfig:
-    return ModelConfig(
-        **{**card, "templates": tuple(card["templates"]), "inputs": FeatureConfig(**card["inputs"])}
-    )
+    names = {k: tuple(card[k]) for k in ("templates", "fabrics") if k in card}
+    return ModelConfig(**{**card, **names, "inputs": FeatureConfig(**card["inputs"])})
 
 
 def _load(

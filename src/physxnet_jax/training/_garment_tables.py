@@ -124,7 +124,8 @@ def prepare_garments(
         valid[name] = jnp.asarray(seen)
         count = wardrobe.num_vertices(name)
         maps = [
-            condition_maps(atlas, body, rest, g, b) for g, b in zip(garments, bound, strict=True)
+            condition_maps(atlas, body, rest, g, b, model.fabrics)
+            for g, b in zip(garments, bound, strict=True)
         ]
         shares = [
             pad_rows(patch_shares(np.asarray(g.mesh.vertices), np.asarray(g.mesh.faces), _PATCH))

@@ -1,5 +1,7 @@
 """Maps that describe a garment to a network: how loose it is, where it ends, what it is made of."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -7,7 +9,7 @@ from jaxtyping import Array, Float, Int
 from scipy.sparse.csgraph import dijkstra
 
 from ..body import NUM_BODY_VERTICES, Body
-from ..garment import Fabric, Garment, refine_garment
+from ..garment import FABRICS, Fabric, Garment, refine_garment
 from ..geometry import boundary_loops, mesh_edges
 from ._atlas import Atlas
 from ._bind import Binding, bind
@@ -41,6 +43,7 @@ def condition_maps(
     rest: Float[Array, "all 3"],
     garment: Garment,
     binding: Binding,
+    fabrics: Sequence[str] | None = None,
 ) -> Float[Array, "height width channels"]:
     """What a network sees of a garment, at the texels that it samples; zero elsewhere.
 
@@ -52,6 +55,8 @@ def condition_maps(
         rest: Its rest vertices [m].
         garment: The garment on it.
         binding: Of its vertices to the atlas.
+        fabrics: Names of the fabrics that the network learned from: properties beyond theirs are
+            seen as the nearest of theirs. None sees all as they are.
 
     Returns:
         The channels of `CONDITIONS`: 1 where there is cloth; its distance to the skin in
@@ -69,6 +74,9 @@ def condition_maps(
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     beneath = _points_beneath(atlas, body, rest, garment, binding)
     fabric = _fabric(garment.fabric)
+    if fabrics:
+        known = np.stack([_fabric(FABRICS[name]) for name in fabrics])
+        fabric = np.clip(fabric, known.min(axis=0), known.max(axis=0))
     values = np.column_stack(
         [
             np.ones(len(vertices)),
