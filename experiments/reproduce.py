@@ -89,7 +89,7 @@ SOFT = ("moon walk", "balancing", "walking")
 ABRUPT = ("strong gesture", "jump", "punch")
 COPIED = (
     *("oracle", "accuracy_cost", "peers", "engines", "training"),
-    *("blender_import", "layers", "adapt"),
+    *("blender_import", "layers", "adapt", "unseen"),
 )
 DOCUMENTS = (
     *("docs/reproduction.md", "docs/accuracy-cost.md", "docs/garments.md"),

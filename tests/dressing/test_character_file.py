@@ -550,3 +550,10 @@ def test_caches_without_a_sample_per_frame_are_refused(clip, tmp_path):
     (tmp_path / "a.pc2").write_bytes(blob)
     with pytest.raises(FormatError, match="every 2 frames"):
         read_pc2(tmp_path / "a.pc2")
+
+
+def test_an_obj_is_a_person_who_stands_still(tmp_path):
+    write_obj(tmp_path / "a.obj", 100 * POINTS, FACES)
+    person = read_character(tmp_path / "a.obj")
+    assert person[0].positions.shape == (1, len(POINTS), 3)
+    np.testing.assert_allclose(np.ptp(person[0].positions[0, :, 1]), 1.7, atol=1e-5)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from physxnet_jax.garment import decimate, grid_faces, mesh_health
+from physxnet_jax.garment import decimate, grid_faces, mesh_health, subdivide, template
 from physxnet_jax.geometry import TriMesh, make_mesh
 
 pytest.importorskip("fast_simplification")
@@ -82,3 +82,15 @@ def test_decimated_faces_do_not_cross_a_texture_seam():
     # What lies across the seam takes what is at it, less than an edge away.
     assert np.abs(away).max() < 0.04 / (2 * np.pi * 0.1) and np.median(np.abs(away)) < 1e-3
     assert_allclose(uv[..., 1], corner[..., 1], atol=0.04)
+
+
+@pytest.mark.release
+def test_decimated_meshes_need_no_repair():
+    """Of millimetre triangles, many of which collapse onto one point."""
+    fine, _ = subdivide(template("top").mesh, 0.006)
+    before = mesh_health(fine)
+    coarse, origin = decimate(fine, 0.008)
+    found = mesh_health(coarse)
+    assert len(origin) == found.faces < 0.8 * before.faces
+    assert (found.coincident_vertices, found.degenerate_faces, found.duplicate_faces) == (0, 0, 0)
+    assert found.unused_vertices == 0 and found.components == before.components

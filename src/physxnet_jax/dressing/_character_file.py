@@ -24,7 +24,10 @@ from ..io import (
 )
 from ..motion import Motion, retarget_to_rig
 
-CHARACTER_FORMATS = (".glb", ".gltf", ".vrm", ".usdc", ".usd", ".usda", ".pc2", ".mdd", ".npz")
+CHARACTER_FORMATS = (
+    *(".glb", ".gltf", ".vrm", ".usdc", ".usd", ".usda"),
+    *(".pc2", ".mdd", ".npz", ".obj"),
+)
 """Extensions that `read_character` supports."""
 
 # Largest number of coordinates of a clip.
@@ -110,6 +113,8 @@ def read_character(
         from ..io import read_usd_meshes as read
     elif suffix == ".npz":
         read = _read_npz
+    elif suffix == ".obj":
+        read = _read_still
     else:
         read = _read_cache
     # Damaged files may contain infinities, which are rejected below.
@@ -144,6 +149,13 @@ def read_character(
             " true rate (--source-fps), or read fewer frames (--frames)."
         )
     return _in_metres(path, _at_rate(whole, float(rate), float(fps), frames), up)
+
+
+def _read_still(path: pathlib.Path, fps: float) -> tuple[list[SourceMesh], float | None, None]:
+    """An OBJ as a person who stands still for one frame."""
+    m = read_obj(path)
+    x = m.vertices[None].astype(np.float32)
+    return [SourceMesh(path.stem, x, m.faces, m.uv, m.uv_faces, None, m.polygons)], None, None
 
 
 def _read_npz(path: pathlib.Path, fps: float) -> tuple[list[SourceMesh], float | None, str | None]:

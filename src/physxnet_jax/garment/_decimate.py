@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from ..errors import MissingDependencyError
 from ..geometry import TriMesh, make_mesh, mesh_edges
+from ._repair import without_faults
 
 # Number of candidates in the search for the nearest face.
 _CANDIDATES = 16
@@ -24,8 +25,8 @@ def decimate(mesh: TriMesh, edge: float) -> tuple[TriMesh, Int[np.ndarray, " few
         edge: The edge length [m].
 
     Returns:
-        The mesh, and for each of its faces the original face nearest to its centroid among
-        those facing the same way, shape [fewer].
+        The mesh, without coincident vertices and degenerate faces, and for each of its faces
+        the original face nearest to its centroid among those facing the same way, shape [fewer].
 
     Raises:
         MissingDependencyError: fast-simplification isn't installed.
@@ -46,7 +47,7 @@ def decimate(mesh: TriMesh, edge: float) -> tuple[TriMesh, Int[np.ndarray, " few
     points, fewer = fast_simplification.simplify(
         x, faces.astype(np.int32), target_count=target_faces
     )[:2]
-    points, fewer = np.asarray(points, np.float64), np.asarray(fewer, np.int64)
+    points, fewer = without_faults(np.asarray(points, np.float64), np.asarray(fewer, np.int64))
     origin = _origin_faces(x[faces], points[fewer])
     if mesh.uv is None or mesh.uv_faces is None:
         return make_mesh(points, fewer), origin

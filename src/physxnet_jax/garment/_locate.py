@@ -33,7 +33,7 @@ _MAX_COST = 0.09
 _FLAT_COST, _THIN = 0.06, 0.01
 # Shifts below this aren't worth a note [m].
 _NOTED = 0.005
-_MAX_PANELS = 200
+_MAX_PANELS, _PANEL = 200, 10
 # Sizes of garments whose unit the user gives [m].
 _SMALLEST, _LARGEST = 0.05, 5.0
 
@@ -204,7 +204,7 @@ def _flat_parts(mesh: StaticMesh) -> int:
     for part in parts:
         x = mesh.vertices[used[label[used] == part]]
         length = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-        if len(x) > 3 and length[2] > _THIN * length[0]:
+        if len(x) < _PANEL or length[2] > _THIN * length[0]:
             return 0
     return len(parts)
 

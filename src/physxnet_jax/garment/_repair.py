@@ -122,6 +122,19 @@ def clean(mesh: TriMesh) -> TriMesh:
     return _rebuild(mesh, x[used], corners.reshape(-1, 3), uv_faces)
 
 
+def without_faults(
+    x: Float[np.ndarray, "vertices 3"], faces: Int[np.ndarray, "faces 3"]
+) -> tuple[Float[np.ndarray, "fewer 3"], Int[np.ndarray, "left 3"]]:
+    """Welds vertices, and removes faces of zero area, duplicate faces and unused vertices."""
+    label = _clusters(x, WELD)
+    _, first = np.unique(label, return_index=True)
+    x, faces = x[first], label[faces]
+    faces = faces[_has_area(x, faces)]
+    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    used, corners = np.unique(faces[np.sort(once)], return_inverse=True)
+    return x[used], corners.reshape(-1, 3)
+
+
 def orient(mesh: TriMesh, body: TriMesh) -> TriMesh:
     """Gives every connected part a consistent winding, outwards from the body.
 

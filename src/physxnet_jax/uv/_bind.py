@@ -238,6 +238,8 @@ def _closest(
 ) -> tuple[Int[np.ndarray, " points"], Float[np.ndarray, "points 3"], Float[np.ndarray, " points"]]:
     """Closest face of each point, its weights there and the squared distance [m^2]."""
     near = nearby_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces), points, neighbours=12)
+    # Of faces that share the closest point, the first counts.
+    near = np.sort(near, axis=1)
     padded = jnp.asarray(padded_rows(points)), jnp.asarray(padded_rows(near))
     found = _closest_among(mesh, *padded)
     parts = (found.face, found.weights, found.squared_distance)
