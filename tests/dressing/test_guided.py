@@ -83,9 +83,8 @@ def test_a_stream_gives_the_clip(guided, motion):
     stream = init_stream(guided, q[:2], p[:2])
     for k in range(FRAMES):
         stream, now = step(guided, stream, q[k], p[k])
-        # Rounding grows from frame to frame; at a contact's threshold it moves single vertices.
-        apart = np.abs(np.asarray(now["bottom"] - whole[k]))
-        assert np.quantile(apart, 0.999) < 1e-5 * 6**k and apart.max() < max(1e-3, 1e-5 * 6**k)
+        # Rounding grows from frame to frame.
+        assert float(jnp.abs(now["bottom"] - whole[k]).max()) < 1e-5 * 6**k
 
 
 @pytest.mark.release
