@@ -186,7 +186,7 @@ MOVING = np.stack([TRIANGLE, TRIANGLE + 0.1])
 )
 def test_character_arrays_of_any_numeric_type_are_read(tmp_path, positions, fps):
     np.savez(tmp_path / "a.npz", positions=positions, faces=np.array([[0, 1, 2]]), fps=fps)
-    person, _, _ = read_character(tmp_path / "a.npz", fps=60.0)
+    person, _, _ = read_character(tmp_path / "a.npz", fps=60.0)[:3]
     assert 3 <= len(person.positions) <= 4
     # Between its frames, not around the end of its type.
     assert np.diff(person.positions[:, 0, 0]).min() >= 0

@@ -42,7 +42,7 @@ def test_written_characters_are_read_back(clip, tmp_path, suffix):
     meshes = [body] if suffix in (".pc2", ".mdd") else [shirt, body]
     write_clip(tmp_path / f"a{suffix}", meshes, 30.0)
     path = tmp_path / (f"a_body{suffix}" if len(meshes) == 1 else f"a{suffix}")
-    mesh, bind, notes = read_character(path, fps=30.0)
+    mesh, bind, notes = read_character(path, fps=30.0)[:3]
     assert mesh.name == "body" and bind is None and notes == ()
     assert mesh.positions.shape == clip.shape and mesh.positions.dtype == np.float32
     # glTF doubles vertices at seams, and their order may change: compare triangles.
@@ -58,7 +58,7 @@ def test_written_characters_are_read_back(clip, tmp_path, suffix):
 def test_unit_and_axes_are_detected(clip, tmp_path, unit, scale):
     upright = clip[..., [0, 2, 1]] * [1.0, -1.0, 1.0] * scale
     np.savez(tmp_path / "me.npz", positions=upright, faces=FACES, fps=30.0)
-    mesh, _, notes = read_character(tmp_path / "me.npz")
+    mesh, _, notes = read_character(tmp_path / "me.npz")[:3]
     np.testing.assert_allclose(mesh.positions, clip, atol=1e-5)
     assert "Z is up" in notes[0] and f"the unit is {unit}" in notes[1]
 
@@ -81,7 +81,7 @@ def test_rig_follows_a_retargeted_motion(body, rest, tmp_path):
     """The body's own mesh as a VRM: it goes where the body goes, to a millimetre."""
     walk = procedural_clip("walk", fps=10.0)
     path = rigged_person(tmp_path / "me.vrm", body)
-    person, bind, _ = read_character(path, fps=10.0, motion=walk)
+    person, bind, _ = read_character(path, fps=10.0, motion=walk)[:3]
     # Points that coincide are one vertex in a file's mesh: compare triangles.
     true = np.asarray(body_animation(body, walk))[:, np.asarray(body.rest_mesh().faces)]
     lowest = true[..., 1].min()
@@ -187,7 +187,7 @@ def test_gltf_skin_matches_linear_blend_skinning(tmp_path, scale, degrees):
     """Against the formula: weighted turns about the joint; the mesh's own node doesn't count."""
     turn = Rotation.from_euler("Y", degrees, degrees=True)
     path = skinned(tmp_path / "a.glb", turn=turn, scale=scale)
-    mesh, bind, notes = read_character(path, fps=10.0)
+    mesh, bind, notes = read_character(path, fps=10.0)[:3]
     assert mesh.positions.shape == (11, 5, 3) and notes == ()
     order = np.lexsort(POINTS.T)
     for k, angle in ((0, 0.0), (5, 0.25), (10, 0.5)):
@@ -375,7 +375,7 @@ def test_usd_skinning_is_baked(tmp_path):
     api.CreateJointWeightsPrimvar(False, 1).Set([1.0] * 5)
     assert root
     stage.Save()
-    found, bind, _ = read_character(tmp_path / "a.usda", fps=10.0)
+    found, bind, _ = read_character(tmp_path / "a.usda", fps=10.0)[:3]
     np.testing.assert_allclose(np.sort(bind, axis=0), np.sort(POINTS, axis=0), atol=1e-5)
     expected = np.stack([POINTS, POINTS + [0.1, 0, 0]])
     np.testing.assert_allclose(found.positions, expected, atol=1e-5)
@@ -421,7 +421,7 @@ def test_usd_orientation_is_read_and_a_missing_up_axis_is_detected(clip, tmp_pat
                 x = np.asarray(points.Get(code))[:, [0, 2, 1]] * np.float32([1.0, -1.0, 1.0])
                 points.Set([tuple(map(float, p)) for p in x], code)
     stage.Export(str(tmp_path / "c.usda"))
-    mesh, _, notes = read_character(tmp_path / "c.usda")
+    mesh, _, notes = read_character(tmp_path / "c.usda")[:3]
     assert "Z is up" in notes[0]
     np.testing.assert_allclose(mesh.positions, clip, atol=1e-5)
 

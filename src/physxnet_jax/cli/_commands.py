@@ -100,7 +100,7 @@ class Effects:
 
 @dataclasses.dataclass(frozen=True)
 class Inspect:
-    """Inspect garment or motion files: properties, problems and how to fix them.
+    """Inspect garments, motions and rigged persons: properties, problems and how to fix them.
 
     Examples:
       physxnet inspect my_shirt.obj
@@ -110,13 +110,16 @@ class Inspect:
 
     files: tyro.conf.Positional[tuple[pathlib.Path, ...]]
     """Garments (.obj, .glb, .gltf, .usd, .usda, .usdc, .ply, .stl; coat.glb#sleeves is one mesh of
-    several) or motions (.bvh, .amc, .npz, .vrma, .glb and .gltf without a mesh, built-in clips)."""
+    several), motions (.bvh, .amc, .npz, .pkl, .vrma, .glb and .gltf without a mesh, built-in clips)
+    or rigged persons (.vrm, .glb, .gltf)."""
     motion: bool = False
     """Inspect the animation of a .glb or .gltf file that also has a mesh."""
     source_fps: float | None = None
     """True frame rate of the motion files, if their headers are wrong."""
     skeleton: pathlib.Path | None = None
     """The ASF file of AMC files."""
+    up: Literal["y", "z"] | None = None
+    """Axis of the motion files that points up, if it isn't found right."""
     joint_map: pathlib.Path | None = None
     """TOML file for unknown joint names of the motion files, with lines like Hips = "pelvis"."""
     terminal: JsonTerminal = dataclasses.field(default_factory=JsonTerminal)

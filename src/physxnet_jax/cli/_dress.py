@@ -18,6 +18,7 @@ from ..dressing import (
     dress,
     load_character,
     load_scene,
+    write_dressed_character,
 )
 from ..errors import FormatError, PhysXNetError
 from ..io import check_output, write_clip
@@ -34,6 +35,7 @@ from ._options import (
     changed,
     check_body,
     check_simulates,
+    with_animation,
 )
 from ._progress import UNWRITTEN, print_json, progress_bars
 from ._shape import parse_shape
@@ -85,7 +87,7 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
         console.print(table)
     if selected is not None:
         console.print(selected.summary, highlight=False)
-    _print_end(clip, (), written, console)
+    _print_end(clip, _lost(job, output), written, console)
     return _code(output, clip)
 
 
@@ -113,7 +115,7 @@ def run_simulate(command: Simulate, console: Console) -> int:
         print_json(rollout_report(clip, seconds) | files)
         return _code(output, clip)
     console.print(rollout_table(clip, job.simulation, seconds))
-    _print_end(clip, job.notes, written, console)
+    _print_end(clip, (*job.notes, *_lost(job, output)), written, console)
     return _code(output, clip)
 
 
@@ -197,6 +199,7 @@ def _job(
 ) -> _Job:
     """Loads the motion, and the character that it drives."""
     shape = load_body().shape(**parse_shape(person.shape)) if person.shape else None
+    word = with_animation(word, source)
     motion: Any = None
     if not person.animated_body:
         motion = load_motion(
@@ -204,6 +207,7 @@ def _job(
             fps=source.fps,
             source_fps=source.source_fps,
             skeleton=source.skeleton,
+            up=source.up,
             joint_map=source.joint_map,
             shape=shape,
         )
@@ -214,6 +218,7 @@ def _job(
             fps=source.fps,
             source_fps=source.source_fps,
             mesh=person.body_mesh,
+            start=source.start,
             frames=source.frames,
             motion=motion,
             joint_map=person.character_map,
@@ -226,7 +231,7 @@ def _job(
         shape=shape,
         frames=source.frames,
         fps=source.fps,
-        start=source.start,
+        start=0.0 if custom is not None else source.start,
         **(defaults | options),
     )
 
@@ -254,10 +259,21 @@ def _run(
     seconds = time.perf_counter() - began
     written: list[pathlib.Path] = []
     if output.out is not None:
-        written += write_clip(output.out, clip.meshes, clip.fps)
+        person = job.motion
+        if isinstance(person, Character) and _keeps_rig(person, output):
+            person = person.after(job.start)
+            written.append(write_dressed_character(output.out, person, clip.garments))
+        else:
+            written += write_clip(output.out, clip.meshes, clip.fps)
     for picture in pictures:
         written.append(render_preview(picture, clip.meshes, clip.fps, progress=progress))
     return clip, written, seconds
+
+
+def _keeps_rig(person: Character, output: Output) -> bool:
+    """Whether the result is a copy of the character's file, with its skin and materials."""
+    out = output.out
+    return bool(out and out.suffix.lower() == ".glb" and output.body and person.rig)
 
 
 def _check_files(out: pathlib.Path | None, pictures: list[pathlib.Path], console: Console) -> None:
@@ -289,6 +305,20 @@ def _check_method(command: Dress) -> None:
             continue
         if command.method == "guided" or (command.method != "network" and flag != "--collisions"):
             raise PhysXNetError(f"{flag} is for networks: --method {command.method} has none.")
+
+
+def _lost(job: _Job, output: Output) -> tuple[str, ...]:
+    """What the format of the result doesn't keep of a character."""
+    out = output.out
+    if out is None or not isinstance(job.motion, Character) or not output.body:
+        return ()
+    if _keeps_rig(job.motion, output):
+        return ("the character's expressions (morph targets) are kept, but not animated",)
+    if job.motion.rig is not None:
+        return (
+            f"{out.suffix} has the character as a moving mesh, without skeleton; .glb keeps it",
+        )
+    return ("the person is written as a moving mesh, without skeleton and materials",)
 
 
 def _print_end(

@@ -10,7 +10,14 @@ from rich.console import Console
 from rich.table import Table
 
 from ..body import load_body
-from ..dressing import Inspection, fit_garment, inspect_garment
+from ..dressing import (
+    CharacterInspection,
+    Inspection,
+    fit_garment,
+    inspect_character,
+    inspect_garment,
+    is_character,
+)
 from ..errors import MeshError
 from ..garment import Opening, template
 from ..io import GltfFile, write_obj
@@ -19,8 +26,9 @@ from ._commands import ExportRest, Fit, Inspect
 from ._progress import print_json, progress_bars
 from ._shape import parse_shape
 
+_Found = Inspection | MotionInspection | CharacterInspection
 # Formats that contain only motion.
-_MOTION_SUFFIXES = (".bvh", ".amc", ".npz", ".vrma")
+_MOTION_SUFFIXES = (".bvh", ".amc", ".npz", ".pkl", ".vrma")
 
 
 def inspect(command: Inspect, console: Console) -> int:
@@ -30,17 +38,18 @@ def inspect(command: Inspect, console: Console) -> int:
     motion_options = {
         "source_fps": command.source_fps,
         "skeleton": command.skeleton,
+        "up": command.up,
         "joint_map": command.joint_map,
     }
     given = [f"--{k.replace('_', '-')}" for k, v in motion_options.items() if v is not None]
-    found: list[Inspection | MotionInspection] = []
+    found: list[_Found] = []
     for file in command.files:
         if command.motion or _is_motion(file):
             found.append(inspect_motion(file, **motion_options))
         elif given:
-            raise MeshError(
-                f"{given[0]} is for motions; {file} is a garment. Inspect it separately."
-            )
+            raise MeshError(f"{given[0]} is for motions; {file} has a mesh. Inspect it separately.")
+        elif is_character(file):
+            found.append(inspect_character(file))
         else:
             found.append(inspect_garment(file))
         if not command.terminal.json:
@@ -109,8 +118,13 @@ def export_rest(command: ExportRest, console: Console) -> int:
     return 0
 
 
-def _show(found: Inspection | MotionInspection, console: Console) -> None:
-    rows = _garment_rows(found) if isinstance(found, Inspection) else _motion_rows(found)
+def _show(found: _Found, console: Console) -> None:
+    if isinstance(found, Inspection):
+        rows = _garment_rows(found)
+    elif isinstance(found, CharacterInspection):
+        rows = _character_rows(found)
+    else:
+        rows = _motion_rows(found)
     table = Table(title=str(found.path), title_justify="left", show_header=False)
     for name, value in rows:
         table.add_row(name, value)
@@ -131,6 +145,17 @@ def _motion_rows(found: MotionInspection) -> list[tuple[str, str]]:
         ("unit", found.unit or "not a usual one; motions don't need it"),
         ("path of the hips", f"{found.travelled:.1f} m, at up to {found.fastest:.1f} m/s"),
         ("lower foot", f"{100 * found.feet:.1f} cm above the floor (median)"),
+    ]
+
+
+def _character_rows(found: CharacterInspection) -> list[tuple[str, str]]:
+    return [
+        ("meshes", f"{', '.join(found.meshes[:6])}: {found.vertices:,} vertices"),
+        ("height", f"{found.height:.4g} ({found.unit or 'unknown unit'})"),
+        ("joint names", found.skeleton),
+        ("joints", f"{found.joints}, followed by {found.carried} joints of the body"),
+        ("saved in", "a pose" if found.saved_in_a_pose else "its bind pose"),
+        ("animations", ", ".join(found.animations[:6]) or "none"),
     ]
 
 
@@ -168,7 +193,7 @@ def _opening(opening: Opening) -> str:
     return f"{' + '.join(opening.limbs) or 'none'} ({opening.around:.2f} m around)"
 
 
-def _to_json(found: Inspection | MotionInspection) -> dict[str, Any]:
+def _to_json(found: _Found) -> dict[str, Any]:
     values = dataclasses.asdict(found) | {"path": str(found.path), "verdict": found.verdict}
     if isinstance(found, Inspection):
         values["openings"] = [{"around": o.around, "limbs": o.limbs} for o in found.openings]

@@ -99,6 +99,10 @@ class MotionSource:
     """Stop after this many frames."""
     source_fps: float | None = None
     """True frame rate of the motion file, if its header is wrong or lacks it."""
+    animation: str | None = None
+    """Name of the animation in a glTF file with several (as FILE#NAME); the longest by default."""
+    up: Literal["y", "z"] | None = None
+    """Axis of the motion file that points up, if it isn't found right."""
     skeleton: pathlib.Path | None = None
     """The ASF file of an AMC file, if it isn't in the same folder."""
     joint_map: pathlib.Path | None = None
@@ -215,8 +219,28 @@ def check_body(options: BodyOptions, source: MotionSource) -> None:
         )
     if options.character_map is not None and options.character is None:
         raise PhysXNetError("--character-map names joints of --character: add --character.")
-    if source.start and custom:
-        raise PhysXNetError("--start cuts motions of the built-in body only: leave it out.")
+    if source.up is not None and options.animated_body:
+        raise PhysXNetError(
+            "--up is for motion files; an --animated-body declares it: leave it out."
+        )
+
+
+def with_animation(motion: str, source: MotionSource) -> str:
+    """The motion's word with the name of its animation.
+
+    Raises:
+        PhysXNetError: It has a name already, or isn't a glTF file.
+    """
+    if source.animation is None:
+        return motion
+    from ..motion import split_animation
+
+    named = f"{motion}#{source.animation}"
+    if split_animation(motion)[1] is not None or split_animation(named)[1] is None:
+        raise PhysXNetError(
+            f"--animation selects an animation of one glTF file: leave it out for {motion}."
+        )
+    return named
 
 
 def check_fabric(outfit: Outfit, method: str, weights: str) -> None:

@@ -10,7 +10,7 @@ from ..errors import PhysXNetError
 from ..files import check_writable
 from ..viewer import Choice, Viewer, record
 from ._commands import View
-from ._options import check_simulates
+from ._options import check_simulates, with_animation
 from ._progress import progress_bars
 from ._shape import parse_shape
 
@@ -40,10 +40,8 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
                 command.inference.weights,
             )
     source = command.source
-    if source.start:
-        raise PhysXNetError("--start: the viewer shows motions from their start; leave it out.")
     choice = Choice(
-        motion=command.motion,
+        motion=with_animation(command.motion, source),
         wear=command.outfit.wear,
         method=command.method,
         inference=command.inference.build(),
@@ -54,6 +52,8 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         fabric=command.outfit.fabric,
         frames=Choice().frames if source.frames is None else source.frames,
         fps=source.fps,
+        start=source.start,
+        up=source.up,
         source_fps=source.source_fps,
         skeleton=source.skeleton,
         joint_map=source.joint_map,

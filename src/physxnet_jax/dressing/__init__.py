@@ -7,6 +7,7 @@ from ._character import (
     Character as Character,
     load_character as load_character,
     make_character as make_character,
+    write_dressed_character as write_dressed_character,
 )
 from ._character_file import read_character as read_character
 from ._clothe import (
@@ -31,6 +32,11 @@ from ._dresser import (
 from ._export import EXPORTED as EXPORTED, export_dresser as export_dresser
 from ._inference import Inference as Inference
 from ._inspect import Inspection as Inspection, inspect_garment as inspect_garment
+from ._inspect_character import (
+    CharacterInspection as CharacterInspection,
+    inspect_character as inspect_character,
+    is_character as is_character,
+)
 from ._meshes import animated_meshes as animated_meshes
 from ._pipeline import infer_block as infer_block
 from ._repair import fit_garment as fit_garment

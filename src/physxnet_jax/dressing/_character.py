@@ -2,7 +2,7 @@
 
 import dataclasses
 import pathlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +11,10 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from ..body import Body, clothed_vertices, load_body, register_body, skin_points
-from ..errors import MeshError
+from ..errors import FormatError, MeshError
 from ..garment import Garment, SkinnedGarment
 from ..geometry import map_frames
-from ..io import AnimatedMesh, smooth_normals
+from ..io import AnimatedMesh, GltfFile, smooth_normals, write_dressed_rig
 from ..motion import (
     BLOCK,
     Motion,
@@ -23,10 +23,12 @@ from ..motion import (
     load_motion,
     padded_block,
     read_joint_map,
+    read_rig,
     resample,
+    slice_motion,
 )
 from ._blocks import PosedClip, resolve_clip_layers
-from ._character_file import read_character
+from ._character_file import RigClip, read_character
 from ._dresser import Dresser
 from .postprocess import BodyCollider, faces_at_rest, resolve_collisions_with_skin
 
@@ -62,6 +64,7 @@ class Character:
             shape and pose alone [m].
         missed: Share of vertices in clothed regions without a counterpart on the surface.
         notes: Remarks on the file.
+        rig: The rig that a motion drives; None for other persons.
     """
 
     mesh: AnimatedMesh
@@ -74,6 +77,30 @@ class Character:
     apart: float
     missed: float
     notes: tuple[str, ...] = ()
+    rig: RigClip | None = None
+
+    def after(self, start: float) -> "Character":
+        """The character from a time on.
+
+        Args:
+            start: Start time [s].
+
+        Raises:
+            MotionError: It is outside the motion.
+        """
+        if not start:
+            return self
+        motion = slice_motion(self.motion, start, None)[0]
+        first = self.motion.num_frames - motion.num_frames
+        mesh = dataclasses.replace(self.mesh, positions=self.mesh.positions[first:])
+        return dataclasses.replace(
+            self,
+            mesh=mesh,
+            motion=motion,
+            residual=self.residual[first:],
+            surface=self.surface[first:],
+            rig=self.rig and self.rig._replace(world=self.rig.world[first:]),
+        )
 
 
 def load_character(
@@ -82,6 +109,7 @@ def load_character(
     fps: float | int = 30.0,
     source_fps: float | int | None = None,
     mesh: str | None = None,
+    start: float = 0.0,
     frames: int | None = None,
     motion: Motion | str | pathlib.Path | None = None,
     joint_map: Mapping[str, str] | str | pathlib.Path | None = None,
@@ -90,12 +118,13 @@ def load_character(
     """Loads a character from a file, as input of `dress`.
 
     Args:
-        path: Animated glTF (skin or morph targets), USD, PC2 or MDD with its OBJ, or npz,
-            see `read_character`.
+        path: Animated glTF (skin or morph targets; ``file.glb#Run`` for one of several
+            animations), USD, PC2 or MDD with its OBJ, or npz, see `read_character`.
         fps: Frames per second.
         source_fps: True frame rate of a file that states none or a wrong one; that of
             `motion`, if it is a file.
         mesh: Name of the body's mesh in the file.
+        start: Start time in the motion [s].
         frames: Keep only this many frames.
         motion: A clip, or what `load_motion` takes, that replaces the file's animation.
             It requires a rigged glTF or VRM whose bones are identified by their names, by
@@ -114,20 +143,22 @@ def load_character(
         motion = load_motion(motion, fps=fps, source_fps=source_fps)
     if motion is not None:
         motion = motion if motion.fps == fps else resample(motion, fps)
-        motion = Motion(motion.rotations[:frames], motion.root[:frames], motion.fps, motion.name)
+        motion = slice_motion(motion, start, frames)[0]
+        start = 0.0
     if isinstance(joint_map, str | pathlib.Path):
         joint_map = read_joint_map(joint_map)
-    person, bind, notes = read_character(
+    read = read_character(
         path,
         fps=fps,
         source_fps=source_fps,
         mesh=mesh,
+        start=start,
         frames=frames,
         motion=motion,
         joint_map=joint_map,
     )
-    character = make_character(person, float(fps), bind=bind, progress=progress)
-    return dataclasses.replace(character, notes=(*notes, *character.notes))
+    character = make_character(read.mesh, float(fps), bind=read.bind, progress=progress)
+    return dataclasses.replace(character, notes=(*read.notes, *character.notes), rig=read.rig)
 
 
 def make_character(
@@ -224,6 +255,51 @@ def _poses(positions: np.ndarray, bind: np.ndarray | None) -> list[np.ndarray]:
     extent = np.ptp(positions[:, :, 0], axis=1) * np.ptp(positions[:, :, 2], axis=1)
     widest = int(np.argmax(extent))
     return first + ([positions[widest]] if widest else [])
+
+
+def write_dressed_character(
+    path: str | pathlib.Path,
+    character: Character,
+    garments: Sequence[AnimatedMesh],
+) -> pathlib.Path:
+    """Writes a copy of a rigged character's file with its new motion, and the garments.
+
+    Skins, materials, images, morph targets, animations and extensions (VRM) are kept.
+
+    Args:
+        path: The ``.glb`` to write.
+        character: A character from `load_character` with a `motion`.
+        garments: The garments of its `DressedClip`.
+
+    Raises:
+        FormatError: The character isn't driven by a motion, the file has another extension,
+            or there are too many frames for morph targets.
+
+    Example:
+        >>> person = load_character("hero.vrm", motion="walk", frames=60)
+        >>> clip = dress(person, ["shirt", "trousers"])
+        >>> write_dressed_character("hero_dressed.glb", person, clip.garments)
+    """
+    path = pathlib.Path(path)
+    if character.rig is None:
+        raise FormatError(
+            f"{path}: only a rig that a motion drives keeps its skin; use write_clip for others."
+        )
+    if path.suffix.lower() != ".glb":
+        raise FormatError(f"{path}: a rig is written as .glb, not {path.suffix}.")
+    rig = character.rig
+    frames = len(garments[0].positions) if garments else len(rig.world)
+    write_dressed_rig(
+        path,
+        rig.path,
+        rig.world[:frames],
+        read_rig(GltfFile(rig.path)).nodes,
+        garments,
+        character.fps,
+        unit=rig.unit,
+        name=rig.name,
+    )
+    return path
 
 
 def bind_to_character(garment: Garment, character: Character) -> Garment:

@@ -4,7 +4,8 @@ import dataclasses
 import functools
 import math
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -21,8 +22,9 @@ from ..io import (
     read_mdd,
     read_obj,
     read_pc2,
+    read_posed_gltf,
 )
-from ..motion import Motion, retarget_to_rig
+from ..motion import Motion, retarget_to_rig, split_animation
 
 CHARACTER_FORMATS = (
     *(".glb", ".gltf", ".vrm", ".usdc", ".usd", ".usda"),
@@ -40,19 +42,55 @@ _HEIGHTS = (0.8, 2.6)
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254}
 
 
+class RigClip(NamedTuple):
+    """A rig that a motion drives.
+
+    Attributes:
+        path: Its glTF or VRM file.
+        world: World matrices of all nodes in the file's unit, shape [frames, nodes, 4, 4].
+        name: Name of the motion.
+        unit: The file's unit [m].
+    """
+
+    path: pathlib.Path
+    world: Float[np.ndarray, "frames nodes 4 4"]
+    name: str
+    unit: float
+
+
+class Read(NamedTuple):
+    """A person as read from a file.
+
+    Attributes:
+        mesh: The person [m], Y up.
+        bind: Bind pose of a skin [m], else None.
+        notes: Notes about the detected unit and axes.
+        unit: The file's unit [m].
+        rig: The rig that a motion drives, else None.
+    """
+
+    mesh: AnimatedMesh
+    bind: Float[np.ndarray, "vertices 3"] | None
+    notes: tuple[str, ...]
+    unit: float
+    rig: RigClip | None = None
+
+
 def read_character(
     path: str | pathlib.Path,
     *,
     fps: float | int = 30.0,
     source_fps: float | int | None = None,
     mesh: str | None = None,
+    start: float = 0.0,
     frames: int | None = None,
     motion: Motion | None = None,
     joint_map: Mapping[str, str] | None = None,
-) -> tuple[AnimatedMesh, Float[np.ndarray, "vertices 3"] | None, tuple[str, ...]]:
+) -> Read:
     """Reads a person animated in another program.
 
-    ``.glb``, ``.gltf``: skins with their first animation, or morph targets. ``.usd*``:
+    ``.glb``, ``.gltf``: skins with their longest animation (or ``file.glb#Run``), or morph
+    targets. ``.usd*``:
     points as time samples, or UsdSkel skins. ``.pc2``, ``.mdd``: caches, with the OBJ of
     their faces beside them. ``.npz``: ``positions``, ``faces`` and ``fps``; the first two may
     have a mesh's name as prefix, as `write_clip` writes. Several meshes are joined, unless one
@@ -64,14 +102,15 @@ def read_character(
         source_fps: True rate of the file. If omitted, the one that the file declares, else 30
             (USD: 24, its default). Ignored for glTF, which stores times.
         mesh: Name of the mesh to read.
+        start: Start time in the animation [s].
         frames: Keep only this many frames.
         motion: Motion of a rigged person (glTF, VRM) in place of the file's animation; the
             result has its rate.
         joint_map: Maps body joints to the file's joints, for `motion` and unknown names.
 
     Returns:
-        The person [m], Y up; the bind pose of a skin, else None; notes about the detected
-        unit and axes.
+        The person, the bind pose of a skin, the rig that a motion drives, and notes about
+        the detected unit and axes.
 
     Raises:
         FormatError: The format is unknown, the file is damaged, the mesh doesn't exist, its
@@ -79,7 +118,7 @@ def read_character(
         MotionError: A glTF is damaged.
         MissingDependencyError: The library that reads the format isn't installed.
     """
-    path = pathlib.Path(path)
+    path, animation = split_animation(path)
     suffix = path.suffix.lower()
     for name, value in (("fps", fps), ("source_fps", source_fps)):
         if value is not None and not (math.isfinite(value) and value > 0):
@@ -98,17 +137,18 @@ def read_character(
             f"{path}: only rigs take another motion, from {', '.join(GLTF_FORMATS[:3])};"
             f" a {suffix} file has its own."
         )
-    if suffix in GLTF_FORMATS:
+    world = None
+    read: Callable[[pathlib.Path, float], tuple[list[SourceMesh], float | None, str | None]]
+    if motion is not None:
+        fps = motion.fps
+        pose = functools.partial(retarget_to_rig, motion=motion, joint_map=joint_map)
+        with np.errstate(all="ignore"):
+            posed, world = read_posed_gltf(path, motion.num_frames, pose)
+        read = lambda path, fps: (posed, fps, "Y")  # noqa: E731
+    elif suffix in GLTF_FORMATS:
         from ..io import read_gltf_meshes
 
-        read = read_gltf_meshes
-        if motion is not None:
-            fps = motion.fps
-            read = functools.partial(
-                read_gltf_meshes,
-                frames=motion.num_frames,
-                pose=functools.partial(retarget_to_rig, motion=motion, joint_map=joint_map),
-            )
+        read = functools.partial(read_gltf_meshes, animation=animation)
     elif suffix.startswith(".usd"):
         from ..io import read_usd_meshes as read
     elif suffix == ".npz":
@@ -142,13 +182,19 @@ def read_character(
     # glTF stores times and was sampled at the requested rate.
     rate = (rate if suffix in GLTF_FORMATS else source_fps or rate) or 30.0
     seconds = (len(whole.positions) - 1) / rate
-    count = seconds * fps + 1 if frames is None else min(seconds * fps + 1, frames)
+    if not 0.0 <= start <= seconds + 1e-6:
+        raise FormatError(f"{path}: start is {start} s, but it lasts from 0 to {seconds:.2f} s.")
+    count = (seconds - start) * fps + 1
+    count = count if frames is None else min(count, frames)
     if count * whole.positions[0].size > _MAX_COORDINATES:
         raise FormatError(
             f"{path}: {seconds:.0f} s at {fps:g} frames per second exceed the limit. Set its"
             " true rate (--source-fps), or read fewer frames (--frames)."
         )
-    return _in_metres(path, _at_rate(whole, float(rate), float(fps), frames), up)
+    found = _in_metres(path, _at_rate(whole, float(rate), float(fps), start, frames), up)
+    if world is None or motion is None:
+        return found
+    return found._replace(rig=RigClip(path, world, motion.name, found.unit))
 
 
 def _read_still(path: pathlib.Path, fps: float) -> tuple[list[SourceMesh], float | None, None]:
@@ -229,12 +275,15 @@ def _read_cache(
     return [SourceMesh("body", positions, shape.faces, shape.uv, shape.uv_faces)], rate, None
 
 
-def _at_rate(moving: SourceMesh, rate: float, fps: float, frames: int | None) -> SourceMesh:
-    """Resamples a clip at another rate, linearly between its frames."""
+def _at_rate(
+    moving: SourceMesh, rate: float, fps: float, start: float, frames: int | None
+) -> SourceMesh:
+    """Cuts a clip and resamples it at another rate, linearly between its frames."""
     x = moving.positions
-    count = int((len(x) - 1) * fps / rate + 1e-3) + 1
+    first = start * rate
+    count = int((len(x) - 1 - first) * fps / rate + 1e-3) + 1
     count = count if frames is None else min(count, frames)
-    at = np.arange(count) * rate / fps
+    at = first + np.arange(count) * rate / fps
     low = np.minimum(at.astype(int), len(x) - 1)
     high = np.minimum(low + 1, len(x) - 1)
     t = (at - low)[:, None, None]
@@ -242,9 +291,7 @@ def _at_rate(moving: SourceMesh, rate: float, fps: float, frames: int | None) ->
     return dataclasses.replace(moving, positions=between.astype(np.float32))
 
 
-def _in_metres(
-    path: pathlib.Path, moving: SourceMesh, up: str | None
-) -> tuple[AnimatedMesh, Float[np.ndarray, "vertices 3"] | None, tuple[str, ...]]:
+def _in_metres(path: pathlib.Path, moving: SourceMesh, up: str | None) -> Read:
     """Converts to metres, by the height of a person, and to Y up, as declared or by extents."""
     x = moving.positions
     extent = np.ptp(x[0], axis=0)
@@ -272,4 +319,4 @@ def _in_metres(
     mesh = AnimatedMesh(
         "body", turned(x), moving.faces, moving.uv, moving.uv_faces, (0.69, 0.46, 0.33)
     )
-    return mesh, bind, tuple(notes)
+    return Read(mesh, bind, tuple(notes), scale)

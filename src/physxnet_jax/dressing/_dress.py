@@ -142,7 +142,7 @@ def dress(
     stages: list[Stage] = []
     inference = Inference() if inference is None else inference
     simulation = Simulation() if simulation is None else simulation
-    _check_options(method, motion, body, shape, start)
+    _check_options(method, motion, body, shape)
     clear_caches_if_full()
     person = _load_person(motion, body, shape, fps, start, frames, stages)
     garments, notes = _load_garments(wear, person, method, stages)
@@ -174,14 +174,12 @@ class _Cloth:
     effects: tuple[str, ...] = ()
 
 
-def _check_options(method: str, motion: Any, body: Any, shape: Any, start: float) -> None:
+def _check_options(method: str, motion: Any, body: Any, shape: Any) -> None:
     if method not in METHODS:
         raise PhysXNetError(f"No method '{method}'; there are {', '.join(METHODS)}.")
     if isinstance(motion, Character):
         if body is not None or shape is not None:
             raise PhysXNetError("A character has its own body: leave out body and shape.")
-        if start:
-            raise PhysXNetError("A character starts at its first frame: leave out start.")
 
 
 def _load_person(
@@ -193,7 +191,10 @@ def _load_person(
     frames: int | None,
     stages: list[Stage],
 ) -> _Person:
-    character = motion if isinstance(motion, Character) else None
+    character = None
+    if isinstance(motion, Character):
+        motion = character = motion.after(start)
+        start = 0.0
     with timed(stages, "motion"):
         if isinstance(motion, Character):
             body, fps, motion = motion.body, motion.fps, motion.motion

@@ -11,7 +11,13 @@ from ._gltf_file import (
     GltfFile as GltfFile,
     nearest_turns as nearest_turns,
 )
-from ._gltf_mesh import read_gltf_meshes as read_gltf_meshes
+from ._gltf_mesh import (
+    read_gltf_meshes as read_gltf_meshes,
+    read_gltf_still as read_gltf_still,
+    read_posed_gltf as read_posed_gltf,
+)
+from ._gltf_rig import write_dressed_rig as write_dressed_rig
+from ._gltf_skin import rest_matrices as rest_matrices
 from ._mdd import read_mdd as read_mdd, write_mdd as write_mdd
 from ._mesh_file import (
     GARMENT_FORMATS as GARMENT_FORMATS,

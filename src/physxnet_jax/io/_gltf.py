@@ -1,7 +1,9 @@
 """Animated glTF with a morph target per frame, for short clips in browsers and engines."""
 
+import json
 import pathlib
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -35,6 +37,20 @@ def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
     References:
         Khronos, glTF 2.0, sections 3.7.2.2 (morph targets) and 3.11 (animations).
     """
+    file = _built(path, meshes, fps)
+    with atomic_write(path) as part, part.open("wb") as target:
+        target.write(b"".join(file.save_to_bytes()))
+
+
+def gltf_document(
+    path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float
+) -> tuple[dict[str, Any], bytes]:
+    """The JSON and the buffer of what `write_gltf` writes."""
+    file = _built(path, meshes, fps)
+    return json.loads(file.gltf_to_json()), file.binary_blob()
+
+
+def _built(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> Any:
     frames = len(meshes[0].positions)
     check_gltf(path, frames)
     import pygltflib
@@ -43,8 +59,7 @@ def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
     for m in meshes:
         file.add(m)
     file.animate(frames, fps)
-    with atomic_write(path) as part, part.open("wb") as target:
-        target.write(b"".join(file.document().save_to_bytes()))
+    return file.document()
 
 
 def check_gltf(path: str | pathlib.Path, frames: int | None = None) -> None:

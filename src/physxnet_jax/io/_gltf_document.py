@@ -12,15 +12,12 @@ from ..files import is_file
 MAX_BYTES = 1_000_000_000
 """Largest file that is read [bytes]."""
 
-# Extensions that compress accessors.
-_COMPRESSIONS = ("EXT_meshopt_compression", "KHR_draco_mesh_compression")
-
 
 def parse_gltf(path: pathlib.Path) -> Any:
     """Parses a glTF 2.0 file with pygltflib.
 
     Raises:
-        MotionError: The file isn't glTF 2.0, is too large, or is compressed.
+        MotionError: The file isn't glTF 2.0, or is too large.
         MissingDependencyError: pygltflib isn't installed.
     """
     try:
@@ -42,7 +39,9 @@ def parse_gltf(path: pathlib.Path) -> Any:
             document: Any = (loader.load_binary if binary else loader.load_json)(str(path))
         version = str(document.asset.version)
         # pygltflib drops the morph weights of nodes.
-        for node, declared in zip(document.nodes, _declared_nodes(path, binary), strict=True):
+        for node, declared in zip(
+            document.nodes, declared_tree(path).get("nodes") or [], strict=True
+        ):
             node.weights = declared.get("weights")
     # pygltflib raises many exception types for damaged files.
     except Exception as error:
@@ -54,24 +53,17 @@ def parse_gltf(path: pathlib.Path) -> Any:
         ) from error
     if document is None or not version.startswith("2"):
         raise MotionError.at(path, None, f"glTF {version}", "Export it as glTF 2.0")
-    for compression in _COMPRESSIONS:
-        if compression in (document.extensionsRequired or ()):
-            raise MotionError.at(
-                path,
-                None,
-                f"its data is compressed ({compression}), which isn't supported",
-                "Decompress it: npx @gltf-transform/cli copy IN OUT",
-            )
     return document
 
 
-def _declared_nodes(path: pathlib.Path, binary: bool) -> list[dict[str, Any]]:
-    """The nodes of the file's JSON as dictionaries."""
+def declared_tree(path: pathlib.Path) -> dict[str, Any]:
+    """The file's JSON as dictionaries."""
     with path.open("rb") as file:
-        if binary:
+        if file.read(4) == b"glTF":
             # A header of 12 bytes, then the length and type of the first chunk.
-            size, _ = struct.unpack("<2I", file.read(20)[12:])
+            size, _ = struct.unpack("<2I", file.read(16)[8:])
             text = file.read(size)
         else:
+            file.seek(0)
             text = file.read()
-    return json.loads(text.decode("utf-8")).get("nodes") or []
+    return json.loads(text.decode("utf-8"))

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import MotionError
 from ..files import is_file
 from ._frame_rate import nominal_rate
-from ._gltf_document import MAX_BYTES, parse_gltf
+from ._gltf_document import MAX_BYTES, declared_tree, parse_gltf
 from ._gltf_track import track_at
 
 _MAX_NODES = 20_000
@@ -109,6 +109,8 @@ class GltfFile:
         if dtype is None or width is None or type(a.count) is not int or a.count < 1:
             raise self.broken(f"accessor {which} of type {a.type}, {a.componentType}, {a.count}")
         if a.bufferView is None:
+            if a.sparse is None and "KHR_draco_mesh_compression" in self._extensions():
+                raise self._compressed("KHR_draco_mesh_compression")
             if a.sparse is None or a.count * width > _MAX_SPARSE:
                 raise self.broken(f"accessor {which} has no values")
             rows = np.zeros((a.count, width), dtype)
@@ -128,17 +130,31 @@ class GltfFile:
         views = self.document.bufferViews
         view = views[self.index(which, views, "view")]
         size = np.dtype(dtype).itemsize * width
+        for compression in view.extensions or ():
+            if "meshopt_compression" in compression:
+                raise self._compressed(compression)
         step = view.byteStride or size
         start = offset or 0
         end = start + step * (count - 1) + size
         if min(start, step - size) < 0 or end > (view.byteLength or 0):
             raise self.broken(f"an accessor reaches past view {which}")
         first = (view.byteOffset or 0) + start
-        blob = self._buffer(view.buffer)
+        blob = self.buffer(view.buffer)
         if first < 0 or first - start + (view.byteLength or 0) > len(blob):
             raise self.broken(f"view {which} reaches past its buffer")
         return np.ndarray(
             (count, width), dtype, buffer=blob, offset=first, strides=(step, size // width)
+        )
+
+    def _extensions(self) -> tuple[str, ...]:
+        return (*(self.document.extensionsRequired or ()), *(self.document.extensionsUsed or ()))
+
+    def _compressed(self, extension: str) -> MotionError:
+        return MotionError.at(
+            self.path,
+            None,
+            f"its meshes are compressed ({extension}), which isn't supported; a motion is read",
+            "Decompress it: npx @gltf-transform/cli copy IN OUT",
         )
 
     def _scatter(self, which: object, sparse: Any, rows: np.ndarray) -> None:
@@ -166,14 +182,7 @@ class GltfFile:
             m = np.array(entry.matrix, float)
             if m.shape != (16,) or not (np.abs(m) < _MAX_COORDINATE).all():
                 raise self.broken(f"the matrix of node {node}")
-            m = m.reshape(4, 4).T
-            scale = np.linalg.norm(m[:3, :3], axis=0)
-            if (scale < 1e-12).any():
-                raise self.broken(f"node {node} is scaled to nothing")
-            # A reflection isn't a rotation: its sign goes to the scale.
-            scale = scale if np.linalg.det(m[:3, :3]) > 0 else -scale
-            turn = Rotation.from_matrix(m[:3, :3] / scale).as_quat()
-            out = {"translation": m[:3, 3], "rotation": turn, "scale": scale}
+            out = self._split(m.reshape(4, 4).T, node)
         if any(
             out[k].shape != (_LENGTHS[k],) or not (np.abs(out[k]) < _MAX_COORDINATE).all()
             for k in out
@@ -202,23 +211,44 @@ class GltfFile:
         return out
 
     def posed(
-        self, turns: Mapping[int, Float[np.ndarray, "frames 3 3"]]
+        self,
+        turns: Mapping[int, Float[np.ndarray, "frames 3 3"]],
+        rest: Float[np.ndarray, "nodes 4 4"] | None = None,
     ) -> Float[np.ndarray, "frames nodes 4 4"]:
         """World matrices of all nodes, with the rotations of some replaced.
 
         Args:
             turns: World rotations by node, without scaling.
+            rest: World matrices of the pose that the others keep relative to their parents;
+                by default the static node transforms.
         """
         frames = len(next(iter(turns.values())))
         out = np.zeros((frames, len(self.parents), 4, 4))
         for n in self.order:
-            place = self.local(n)
+            place = self.local(n) if rest is None else self._between(rest, n)
             turn = Rotation.from_quat(place["rotation"]).as_matrix()[None]
             if n in turns:
                 above = out[:, self.parents[n], :3, :3] if self.parents[n] >= 0 else np.eye(3)[None]
                 turn = np.swapaxes(nearest_turns(above), 1, 2) @ turns[n]
             self._set_world(out, n, turn, {k: v[None] for k, v in place.items()})
         return out
+
+    def _between(
+        self, world: Float[np.ndarray, "nodes 4 4"], n: int
+    ) -> dict[str, Float[np.ndarray, " n"]]:
+        """Translation, rotation and scale of a node relative to its parent."""
+        parent = int(self.parents[n])
+        m = world[n] if parent < 0 else np.linalg.pinv(world[parent]) @ world[n]
+        return self._split(m, n)
+
+    def _split(self, m: Float[np.ndarray, "4 4"], node: int) -> dict[str, Float[np.ndarray, " n"]]:
+        scale = np.linalg.norm(m[:3, :3], axis=0)
+        if (scale < 1e-12).any():
+            raise self.broken(f"node {node} is scaled to nothing")
+        # A reflection isn't a rotation: its sign goes to the scale.
+        scale = scale if np.linalg.det(m[:3, :3]) > 0 else -scale
+        turn = Rotation.from_matrix(m[:3, :3] / scale).as_quat()
+        return {"translation": m[:3, 3], "rotation": turn, "scale": scale}
 
     def _set_world(
         self,
@@ -385,6 +415,14 @@ class GltfFile:
             self._images[source] = self._read_image(source)
         return self._images[source]
 
+    def image_bytes(self, which: int) -> bytes | None:
+        """Bytes of an image; None if its file is missing."""
+        return self._read_image(which)[1]
+
+    def declared(self) -> dict[str, Any]:
+        """The file's JSON as dictionaries."""
+        return declared_tree(self.path)
+
     def _read_image(self, source: object) -> tuple[str, bytes | None]:
         document = self.document
         entry = document.images[self.index(source, document.images, "image")]
@@ -393,7 +431,7 @@ class GltfFile:
             views = document.bufferViews
             view = views[self.index(entry.bufferView, views, "view")]
             start, size = view.byteOffset or 0, view.byteLength or 0
-            blob = self._buffer(view.buffer)
+            blob = self.buffer(view.buffer)
             if min(start, size) < 0 or start + size > len(blob):
                 raise self.broken(f"view {entry.bufferView} reaches past its buffer")
             return name, blob[start : start + size]
@@ -413,7 +451,8 @@ class GltfFile:
         except binascii.Error as error:
             raise self.broken(f"{what} isn't base64") from error
 
-    def _buffer(self, which: object) -> bytes:
+    def buffer(self, which: object) -> bytes:
+        """Bytes of a buffer."""
         n = self.index(which, self.document.buffers, "buffer")
         if n not in self._buffers:
             uri = self.document.buffers[n].uri

@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from ..errors import FormatError, PhysXNetError
 from ..geometry import Polygons, make_material, make_texture
 from ._gltf_file import GltfFile
+from ._gltf_skin import bind_place, inverse_binds, skin_joints
 from ._source_mesh import SourceMesh, welded
 from ._uv_transform import make_uv_transform, moved
 
@@ -26,17 +27,14 @@ def read_gltf_meshes(
     path: pathlib.Path,
     fps: float,
     *,
-    frames: int | None = None,
-    pose: Callable[[GltfFile], Float[np.ndarray, "frames nodes 4 4"]] | None = None,
+    animation: str | None = None,
 ) -> tuple[list[SourceMesh], float | None, str | None]:
     """Reads every skinned mesh of an animated file; all meshes if none is skinned.
 
     Args:
         path: The file.
         fps: Frames per second at which the animation is sampled.
-        frames: Number of frames of `pose`.
-        pose: Computes world matrices of all nodes that replace the file's animation, at
-            `fps` frames per second; the lowest point of the clip is put on the floor.
+        animation: Its name; the longest if omitted.
 
     Returns:
         The meshes, their frame rate, and the up axis.
@@ -50,17 +48,46 @@ def read_gltf_meshes(
     """
     with _report_damage(path):
         file = GltfFile(path)
-        if pose is not None and frames is not None:
-            parts = _read(file, None, frames, lambda: pose(file))
-            parts = [p for p in parts if p.bind is not None]
-            low = min((float(p.positions[..., 1].min()) for p in parts), default=0.0)
-            shift = np.array([0.0, low, 0.0], np.float32)
-            parts = [dataclasses.replace(p, positions=p.positions - shift) for p in parts]
-        else:
-            times = file.frame_times(rate=fps)[0]
-            parts = _read(file, times, len(times), lambda: file.world(times))
+        chosen = file.animation(animation)
+        times = file.frame_times(chosen, rate=fps)[0]
+        parts = _read(file, times, len(times), lambda: file.world(times, chosen), chosen)
         moving = [p for p in parts if p.bind is not None] or parts
         return [welded(p) for p in moving], float(fps), "Y"
+
+
+def read_posed_gltf(
+    path: pathlib.Path,
+    frames: int,
+    pose: Callable[[GltfFile], Float[np.ndarray, "frames nodes 4 4"]],
+) -> tuple[list[SourceMesh], Float[np.ndarray, "frames nodes 4 4"]]:
+    """Reads every skinned mesh of a file in other poses; the lowest point is put on the floor.
+
+    Args:
+        path: The file.
+        frames: Number of frames of `pose`.
+        pose: Computes world matrices of all nodes.
+
+    Returns:
+        The meshes, and the world matrices with the person on the floor.
+
+    Raises:
+        FormatError: A mesh has no triangles, or its weights don't fit.
+        MotionError: The file is damaged.
+    """
+    with _report_damage(path):
+        file = GltfFile(path)
+        world: list[np.ndarray] = []
+
+        def placed() -> Float[np.ndarray, "frames nodes 4 4"]:
+            world.append(pose(file))
+            return world[0]
+
+        parts = [p for p in _read(file, None, frames, placed) if p.bind is not None]
+        low = min((float(p.positions[..., 1].min()) for p in parts), default=0.0)
+        shift = np.array([0.0, low, 0.0], np.float32)
+        moved = [dataclasses.replace(p, positions=p.positions - shift) for p in parts]
+        world[0][..., 1, 3] -= low
+        return [welded(p) for p in moved], world[0]
 
 
 def read_gltf_still(path: pathlib.Path) -> list[SourceMesh]:
@@ -92,6 +119,7 @@ def _read(
     times: Float[np.ndarray, " frames"] | None,
     count: int,
     place: Callable[[], Float[np.ndarray, "frames nodes 4 4"]],
+    animation: int | None = None,
 ) -> list[SourceMesh]:
     """Reads meshes over `count` frames, with node matrices of `place` and morphs at `times`."""
     if count * len(file.document.nodes) > _MAX_NODE_MATRICES:
@@ -106,7 +134,7 @@ def _read(
         if node.mesh is None:
             continue
         mesh = file.document.meshes[file.index(node.mesh, file.document.meshes, "mesh")]
-        weights = file.morph_weights(n, times)
+        weights = file.morph_weights(n, times, animation)
         for primitive in mesh.primitives:
             if (primitive.mode if primitive.mode is not None else _TRIANGLES) != _TRIANGLES:
                 continue
@@ -115,7 +143,7 @@ def _read(
             points += part.positions.shape[1]
             _check_size(file, count, points)
             if node.skin is not None:
-                part = _skinned(file, node.skin, primitive, part, world, still)
+                part = _skinned(file, node.skin, n, primitive, part, world, still)
             else:
                 part = _transformed(file, part, world[:, n])
             parts.append(part)
@@ -251,21 +279,13 @@ def _transformed(
 def _skinned(
     file: GltfFile,
     which: int,
+    node: int,
     primitive: object,
     part: SourceMesh,
     world: Float[np.ndarray, "frames nodes 4 4"],
     still: Float[np.ndarray, "nodes 4 4"],
 ) -> SourceMesh:
-    skin = file.document.skins[file.index(which, file.document.skins, "skin")]
-    joints = [file.index(j, file.document.nodes, "joint") for j in skin.joints]
-    if len(set(joints)) < len(joints) or not joints:
-        raise FormatError(f"{file.path}: a skin has no joints, or lists a joint twice.")
-    binds = np.tile(np.eye(4), (len(joints), 1, 1))
-    if skin.inverseBindMatrices is not None:
-        entry = np.asarray(file.accessor(skin.inverseBindMatrices), float)
-        if entry.shape != (len(joints), 16) or not np.isfinite(entry).all():
-            raise FormatError(f"{file.path}: bind matrices of '{part.name}' don't fit its joints.")
-        binds = entry.reshape(-1, 4, 4).swapaxes(1, 2)
+    joints, binds = skin_joints(file, which), inverse_binds(file, which)
     weights = _joint_weights(file, primitive, part, len(joints))
     frames, vertices = len(world), part.positions.shape[1]
     _check_size(file, frames, vertices)
@@ -275,10 +295,8 @@ def _skinned(
     for f in range(frames):
         blend = (weights @ matrices[f, :, :3].reshape(len(joints), 12)).reshape(-1, 3, 4)
         out[f] = np.einsum("vab,vb->va", blend[:, :, :3], x[f]) + blend[:, :, 3]
-    # The vertices are in the bind pose, which the topmost joint places in the world.
-    rank = {n: k for k, n in enumerate(file.order)}
-    top = min(range(len(joints)), key=lambda k: rank[joints[k]])
-    place = still[joints[top]] @ binds[top]
+    # The vertices are in the bind pose.
+    place = bind_place(file, which, node, still, binds)
     bind = part.positions[0] @ place[:3, :3].T + place[:3, 3]
     return dataclasses.replace(part, positions=out, bind=bind.astype(np.float32))
 

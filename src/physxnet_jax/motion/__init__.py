@@ -4,7 +4,11 @@ from ._asf_amc import read_amc as read_amc
 from ._bvh import read_bvh as read_bvh
 from ._faults import sudden_turns as sudden_turns
 from ._fit_motion import fit_motion as fit_motion
-from ._gltf import read_gltf as read_gltf, split_animation as split_animation
+from ._gltf import (
+    read_gltf as read_gltf,
+    read_rig as read_rig,
+    split_animation as split_animation,
+)
 from ._inspect import MotionInspection as MotionInspection, inspect_motion as inspect_motion
 from ._load import load_motion as load_motion, save_motion as save_motion
 from ._motion import (
@@ -19,6 +23,7 @@ from ._prepare import prepare_motion as prepare_motion, slice_motion as slice_mo
 from ._procedural import CLIPS as CLIPS, procedural_clip as procedural_clip
 from ._retarget import (
     foot_heights as foot_heights,
+    joint_index as joint_index,
     retarget as retarget,
     stand_on_floor as stand_on_floor,
 )

@@ -1,12 +1,13 @@
 """Reader of glTF skeletons and animations: the joints of a skin, or all rotating nodes."""
 
 import pathlib
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from ..errors import MotionError, PhysXNetError
-from ..io import GLTF_FORMATS, GltfFile, nearest_turns
+from ..io import GLTF_FORMATS, GltfFile, nearest_turns, rest_matrices
 from ._source import SourceClip
 
 
@@ -19,8 +20,9 @@ def read_gltf(path: str | pathlib.Path, animation: str | None = None) -> SourceC
 
     Returns:
         World rotations and positions of the joints of the largest skin, or of every node
-        with an animated rotation if there is no skin. The static node transforms are the
-        rest pose. Joints that VRM declares as humanoid bones take their VRM names.
+        with an animated rotation and those below it if there is no skin. The rest pose is
+        the bind pose of the skin, else that of the static node transforms. Joints that VRM
+        declares as humanoid bones take their VRM names.
 
     Raises:
         MotionError: Damaged files, files without an animation, or a skeleton with zero
@@ -49,7 +51,9 @@ def _read(path: pathlib.Path, animation: str | None) -> SourceClip:
     chosen = file.animation(animation)
     times, fps = file.frame_times(chosen)
     nodes = skeleton_nodes(file, chosen)
-    return _clip(file, nodes, file.world(times, chosen)[:, nodes], fps)
+    rest = rest_matrices(file)
+    rest = file.world()[0] if rest is None else rest
+    return _clip(file, nodes, file.world(times, chosen)[:, nodes], fps, rest)
 
 
 def split_animation(path: str | pathlib.Path) -> tuple[pathlib.Path, str | None]:
@@ -70,18 +74,38 @@ def other_animations(path: pathlib.Path) -> tuple[str, list[str]]:
     return chosen, [n for n in names if n != chosen]
 
 
-def read_rig(file: GltfFile) -> tuple[SourceClip, list[int]]:
-    """Reads a file's static skeleton as a one-frame clip, with the node of each joint.
+class Rig(NamedTuple):
+    """A file's skeleton at rest.
+
+    Attributes:
+        clip: A clip of one frame.
+        nodes: Node of each joint.
+        rest: World matrices of all nodes in the bind pose, None if the nodes stand in it.
+    """
+
+    clip: SourceClip
+    nodes: list[int]
+    rest: Float[np.ndarray, "nodes 4 4"] | None
+
+
+def read_rig(file: GltfFile) -> Rig:
+    """Reads a file's skeleton in its bind pose.
 
     Raises:
         MotionError: No skeleton, or one with zero scale.
     """
     nodes = skeleton_nodes(file)
-    return _clip(file, nodes, file.world()[:, nodes], 30.0), nodes
+    bound = rest_matrices(file)
+    rest = file.world()[0] if bound is None else bound
+    return Rig(_clip(file, nodes, rest[None, nodes], 30.0, rest), nodes, bound)
 
 
 def _clip(
-    file: GltfFile, nodes: list[int], moving: Float[np.ndarray, "frames joints 4 4"], fps: float
+    file: GltfFile,
+    nodes: list[int],
+    moving: Float[np.ndarray, "frames joints 4 4"],
+    fps: float,
+    rest_world: Float[np.ndarray, "nodes 4 4"],
 ) -> SourceClip:
     bones = file.bones()
     taken = set(bones.values())
@@ -92,7 +116,7 @@ def _clip(
     if len(set(names)) < len(names):
         raise MotionError.at(file.path, None, "two joints have the same name", "Rename one")
     parents = skeleton_parents(file, nodes)
-    static = file.world()[:, nodes]
+    static = rest_world[None, nodes]
     rotations, rest = _turns(file, moving), _turns(file, static)[0]
     return SourceClip(
         tuple(names),
@@ -121,10 +145,27 @@ def skeleton_nodes(file: GltfFile, animation: int = 0) -> list[int]:
             for c in (moving.channels if moving else ())
             if c.target.path == "rotation" and c.target.node is not None
         }
+        wanted |= _below(file, wanted)
     nodes = [n for n in file.order if n in wanted]
     if len(nodes) < 2:
         raise MotionError.at(file.path, None, "no skeleton", "Export it with its skin")
     return nodes
+
+
+def _below(file: GltfFile, moving: set[int]) -> set[int]:
+    """Nodes below animated ones that may be joints without keys: named, and unlike others."""
+    nodes = file.document.nodes
+    names = {str(nodes[n].name) for n in moving}
+    inside, out = set(moving), set()
+    for n in file.order:
+        if n in inside or int(file.parents[n]) not in inside:
+            continue
+        inside.add(n)
+        name = str(nodes[n].name or "")
+        if name and name not in names and nodes[n].mesh is None and nodes[n].camera is None:
+            names.add(name)
+            out.add(n)
+    return out
 
 
 def skeleton_parents(file: GltfFile, nodes: list[int]) -> list[int]:

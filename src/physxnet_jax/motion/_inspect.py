@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import shlex
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -91,6 +91,7 @@ def inspect_motion(
     *,
     source_fps: float | int | None = None,
     skeleton: str | pathlib.Path | None = None,
+    up: Literal["y", "z"] | None = None,
     joint_map: Mapping[str, str] | str | pathlib.Path | None = None,
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
@@ -101,6 +102,7 @@ def inspect_motion(
         motion: As for `load_motion`.
         source_fps: True rate of the file, if its header is wrong or has none [1/s].
         skeleton: The ASF of an AMC file.
+        up: Axis of the file that points up, as for `load_motion`.
         joint_map: Body joint to the file's joint, or a TOML file of such pairs.
         body: Body to retarget to; the built-in one by default.
         shape: Its shape parameters.
@@ -121,7 +123,11 @@ def inspect_motion(
         options += ["--skeleton", shlex.quote(str(skeleton))]
     if source_fps is not None:
         options += ["--source-fps", f"{source_fps:g}"]
-    read = read_motion(motion, source_fps=source_fps, skeleton=skeleton, body=body, shape=shape)
+    if up is not None:
+        options += ["--up", up]
+    read = read_motion(
+        motion, source_fps=source_fps, skeleton=skeleton, up=up, body=body, shape=shape
+    )
     clip = fitted_motion(read, body, joint_map=mapping, shape=shape)
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     found, trajectory = _skeleton(read, mapping, body, rest), _trajectory(body, clip, rest)

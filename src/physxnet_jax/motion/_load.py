@@ -4,6 +4,7 @@ import dataclasses
 import math
 import pathlib
 from collections.abc import Mapping
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,11 +13,12 @@ from ..body import Body, load_body
 from ..errors import MotionError
 from ..files import atomic_write, is_file, read_arrays
 from ..io import GLTF_FORMATS
-from ._amass import AMASS_ARRAYS, amass_clip
+from ._amass import AMASS_ARRAYS, amass_clip, is_amass
 from ._asf_amc import read_amc
 from ._bvh import read_bvh
 from ._gltf import read_gltf, split_animation
 from ._motion import Motion, make_motion, resample
+from ._pickle import read_pickled_arrays
 from ._procedural import CLIPS, procedural_clip
 from ._retarget import retarget, stand_on_floor
 from ._skeletons import read_joint_map
@@ -29,6 +31,7 @@ def load_motion(
     fps: float | int | None = None,
     source_fps: float | int | None = None,
     skeleton: str | pathlib.Path | None = None,
+    up: Literal["y", "z"] | None = None,
     joint_map: Mapping[str, str] | str | pathlib.Path | None = None,
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
@@ -38,12 +41,13 @@ def load_motion(
     Args:
         motion: A file or the name of a built-in clip. Files are `.bvh`, `.amc` (with its
             ASF), `.glb`, `.gltf` or `.vrma` with an animation (the longest, or
-            ``file.glb#Run``), and `.npz` written by
-            `save_motion` or from AMASS (SMPL, SMPL+H or SMPL-X poses).
+            ``file.glb#Run``), and `.npz` written by `save_motion`, from AMASS (SMPL,
+            SMPL+H or SMPL-X poses) or with the arrays of AIST++ (`.pkl` too) or 4D-Humans.
         fps: Resample to this rate [1/s].
         source_fps: True rate of the file [1/s], if its header is wrong or has none (files
             of CMU's subjects 60 and 61 declare 120 and have 60).
         skeleton: The ASF of an AMC file.
+        up: Axis of the file that points up; found from the skeleton if omitted.
         joint_map: Body joint to the file's joint, for a skeleton with unknown names, or
             a TOML file of such pairs (`read_joint_map`).
         body: Body to retarget to; the built-in one by default.
@@ -62,7 +66,7 @@ def load_motion(
         30.0
     """
     read = read_motion(
-        motion, fps=fps, source_fps=source_fps, skeleton=skeleton, body=body, shape=shape
+        motion, fps=fps, source_fps=source_fps, skeleton=skeleton, up=up, body=body, shape=shape
     )
     clip = fitted_motion(read, body, joint_map=joint_map, shape=shape)
     return clip if fps is None or fps == clip.fps else resample(clip, fps)
@@ -97,6 +101,7 @@ def read_motion(
     fps: float | int | None = None,
     source_fps: float | int | None = None,
     skeleton: str | pathlib.Path | None = None,
+    up: Literal["y", "z"] | None = None,
     body: Body | None = None,
     shape: Float[Array, " shapes"] | None = None,
 ) -> SourceClip | Motion:
@@ -107,12 +112,15 @@ def read_motion(
         fps: Rate at which a built-in clip is computed [1/s].
         source_fps: True rate of the file.
         skeleton: The ASF of an AMC file.
+        up: Axis of the file that points up, if stated.
         body: Body of built-in clips.
         shape: Its shape parameters.
     """
     for name, rate in (("fps", fps), ("source_fps", source_fps)):
         if rate is not None and not (math.isfinite(rate) and rate > 0):
             raise MotionError(f"{name} is {rate}, expected a positive number.")
+    if up not in (None, "y", "z"):
+        raise MotionError(f"up is '{up}', expected 'y' or 'z'.")
     path, animation = split_animation(motion)
     suffix = path.suffix.lower()
     if skeleton is not None and suffix != ".amc":
@@ -123,14 +131,16 @@ def read_motion(
         read = read_amc(path, skeleton)
     elif suffix in GLTF_FORMATS:
         read = read_gltf(path, animation)
-    elif suffix == ".npz":
-        read = _read_npz(path)
+    elif suffix in (".npz", ".pkl"):
+        read = _read_npz(path, source_fps, up)
     elif str(motion) in CLIPS:
         if source_fps is not None:
             raise MotionError(
                 f"source_fps is the true rate of a file; '{motion}' is computed at any rate."
                 " Leave it out."
             )
+        if up is not None:
+            raise MotionError(f"up is the axis of a file; '{motion}' has Y up. Leave it out.")
         return procedural_clip(str(motion), fps=float(fps or 30), body=body, shape=shape)
     elif suffix == ".fbx":
         raise MotionError.at(
@@ -138,9 +148,14 @@ def read_motion(
         )
     else:
         raise MotionError(
-            f"{motion}: neither a .bvh, .amc, .glb, .gltf, .vrma or .npz file nor a built-in clip"
+            f"{motion}: neither a .bvh, .amc, .glb, .gltf, .vrma, .npz or .pkl file nor a built-in"
+            " clip"
             f" ({', '.join(CLIPS)})."
         )
+    if up is not None:
+        if isinstance(read, Motion):
+            raise MotionError(f"{motion}: 'up' is for other skeletons; here Y is up. Leave it out.")
+        read = dataclasses.replace(read, up=up)
     return read if source_fps is None else dataclasses.replace(read, fps=float(source_fps))
 
 
@@ -155,15 +170,20 @@ def save_motion(path: str | pathlib.Path, motion: Motion) -> None:
         )
 
 
-def _read_npz(path: pathlib.Path) -> Motion | SourceClip:
+def _read_npz(
+    path: pathlib.Path, source_fps: float | int | None, up: Literal["y", "z"] | None
+) -> Motion | SourceClip:
     if not is_file(path):
         raise MotionError.at(path, None, "no such file", "Check the path")
     try:
-        data = read_arrays(path, ("rotations", "root", "fps", *AMASS_ARRAYS))
+        if path.suffix.lower() == ".pkl":
+            data = read_pickled_arrays(path, AMASS_ARRAYS)
+        else:
+            data = read_arrays(path, ("rotations", "root", "fps", *AMASS_ARRAYS))
     except ValueError as error:
         raise _not_motion(path, str(error)) from error
-    if "trans" in data:
-        return amass_clip(data, path)
+    if is_amass(data):
+        return amass_clip(data, path, source_fps, up)
     if not {"rotations", "root", "fps"} <= data.keys() or data["fps"].size != 1:
         raise _not_motion(path, f"it holds {', '.join(sorted(data)) or 'nothing known'}")
     if not all(is_real(data[k]) for k in ("rotations", "root", "fps")):
@@ -182,6 +202,7 @@ def _not_motion(path: pathlib.Path, problem: str) -> MotionError:
         path,
         None,
         f"not a motion archive ({problem[:200]})",
-        "It needs arrays rotations [frames, joints, 4], root [frames, 3] and fps, or poses,"
-        " trans and mocap_framerate as in AMASS",
+        "It needs arrays rotations [frames, joints, 4], root [frames, 3] and fps, or those of"
+        " AMASS (poses, trans, mocap_framerate), AIST++ (smpl_poses, smpl_trans) or 4D-Humans"
+        " (global_orient, body_pose)",
     )

@@ -42,6 +42,27 @@ class Motion:
         """Number of frames."""
         return self.root.shape[0]
 
+    def __getitem__(self, frames: slice) -> "Motion":
+        """The motion of some frames; a step other than 1 changes the frame rate.
+
+        Raises:
+            MotionError: No frame is left, or the step isn't positive.
+
+        Example:
+            >>> procedural_clip("walk", fps=30.0)[10:40].num_frames
+            30
+        """
+        if not isinstance(frames, slice):
+            raise MotionError(f"a motion is cut by a slice, as in motion[10:40], not [{frames!r}].")
+        step = 1 if frames.step is None else int(frames.step)
+        count = len(range(*frames.indices(self.num_frames)))
+        if step < 1 or count == 0:
+            raise MotionError(
+                f"{self.name}: {frames.start}:{frames.stop}:{step} of {self.num_frames} frames"
+                " leaves none in their order."
+            )
+        return Motion(self.rotations[frames], self.root[frames], self.fps / step, name=self.name)
+
 
 def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "motion") -> Motion:
     """A `Motion` from host arrays, checked and normalised.

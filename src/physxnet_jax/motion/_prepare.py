@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 from collections.abc import Mapping
+from typing import Literal
 
 from jaxtyping import Array, Float
 
@@ -23,6 +24,7 @@ def prepare_motion(
     frames: int | None = None,
     source_fps: float | None = None,
     skeleton: str | pathlib.Path | None = None,
+    up: Literal["y", "z"] | None = None,
     joint_map: Mapping[str, str] | str | pathlib.Path | None = None,
 ) -> Motion:
     """Loads or resamples a motion, moves it to the floor for the body's shape, and slices it.
@@ -36,6 +38,7 @@ def prepare_motion(
         frames: Keep only this many frames.
         source_fps: True rate of a motion file [1/s].
         skeleton: The ASF of an AMC file.
+        up: Axis of the file that points up, as for `load_motion`.
         joint_map: Joint map of a motion file, as for `load_motion`.
 
     Raises:
@@ -43,7 +46,8 @@ def prepare_motion(
             is outside the motion, or an option for motion files is given with a `Motion`.
     """
     if isinstance(motion, Motion):
-        of_files = {"source_fps": source_fps, "skeleton": skeleton, "joint_map": joint_map}
+        of_files = {"source_fps": source_fps, "skeleton": skeleton, "up": up}
+        of_files |= {"joint_map": joint_map}
         given = [name for name, value in of_files.items() if value is not None]
         if given:
             raise MotionError(
@@ -60,6 +64,7 @@ def prepare_motion(
             fps=30.0 if fps is None else fps,
             source_fps=source_fps,
             skeleton=skeleton,
+            up=up,
             joint_map=joint_map,
             body=body,
             shape=shape,
@@ -89,8 +94,6 @@ def slice_motion(clip: Motion, start: float, frames: int | None) -> tuple[Motion
     begin = min(round(first), clip.num_frames - 1)
     end = clip.num_frames if frames is None else min(begin + frames, clip.num_frames)
 
-    def part(kept: slice) -> Motion:
-        return dataclasses.replace(clip, rotations=clip.rotations[kept], root=clip.root[kept])
-
+    past = dataclasses.replace(clip, rotations=clip.rotations[:begin], root=clip.root[:begin])
     whole = (begin, end) == (0, clip.num_frames)
-    return clip if whole else part(slice(begin, end)), part(slice(0, begin))
+    return clip if whole else clip[begin:end], past

@@ -20,6 +20,8 @@ SHORTEST, LONGEST = 1e-9, 1e9
 _STANDING = float(np.cos(np.radians(45.0)))
 # A mean trunk direction with a component above this points that way throughout the clip.
 ALWAYS = 0.8
+# Turns Z up to Y up.
+Y_UP = Rotation.from_euler("X", -90, degrees=True).as_matrix()
 # A T-pose that isn't part of a motion is left within this time [s].
 _SOON = 0.25
 # DAZ figures hold their forearms 17 degrees forward in their T-pose.
@@ -29,11 +31,15 @@ _T_POSE = float(np.cos(np.radians(25.0)))
 def upright(source: SourceClip, index: Mapping[str, int]) -> SourceClip:
     """Turns the clip to Y up if its skeleton stands along Z at rest.
 
-    Only the rest pose is turned if the motion stands along Y already.
+    Only the rest pose is turned if the motion stands along Y already. If the user states the
+    motion's up axis, this counts.
     """
-    if stands(source, index, 2) and not stands(source, index, 1):
-        turn = Rotation.from_euler("X", -90, degrees=True).as_matrix()
-        turned = source.turned(turn)
+    turned = source.turned(Y_UP)
+    lies = stands(source, index, 2) and not stands(source, index, 1)
+    if source.up is not None:
+        out = turned if source.up == "z" else source
+        return dataclasses.replace(out, rest=(turned if lies else source).rest)
+    if lies:
         if mean_trunk(source, index)[1] > ALWAYS:
             return dataclasses.replace(source, rest=turned.rest)
         return turned

@@ -41,7 +41,7 @@ def retarget_to_rig(
         MotionError: No skeleton, unknown joints, or a limb of length zero.
     """
     body = load_body() if body is None else body
-    rig, nodes = read_rig(file)
+    rig, nodes, bound = read_rig(file)
     index = joint_index(rig, body, joint_map)
     rig = upright(rig, index)
     reference, _, stance, _, _ = reference_pose(rig, index)
@@ -54,7 +54,7 @@ def retarget_to_rig(
         j = body.joint(name)
         from_body = (Rotation.from_matrix(stance) * aligned[j]).inv().as_matrix()
         turns[nodes[joint]] = world[:, j] @ from_body @ reference[joint]
-    out = file.posed(turns)
+    out = file.posed(turns, bound)
     heads = np.asarray(body.joint_positions(rest)[0], np.float64)
     scale = leg_length(rig.positions()[0], index.__getitem__) / leg_length(heads, body.joint)
     thighs = [body.joint("LeftUpLeg"), body.joint("RightUpLeg")]

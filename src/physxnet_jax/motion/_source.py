@@ -1,6 +1,7 @@
 """Motion as read from a file, before retargeting: any skeleton, any unit."""
 
 import dataclasses
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -35,6 +36,7 @@ class SourceClip:
             [joints, 3, 3]; identity if omitted.
         shifts: Position of every joint in its parent's frame if it varies over time, shape
             [frames, joints, 3]; `offsets` in every frame if omitted.
+        up: Axis that points up in the motion, if the user states it.
 
     Raises:
         MotionError: Positions too large for a skeleton in any unit.
@@ -50,6 +52,7 @@ class SourceClip:
     path: str
     rest: Float[np.ndarray, "joints 3 3"] | None = None
     shifts: Float[np.ndarray, "frames joints 3"] | None = None
+    up: Literal["y", "z"] | None = None
 
     def __post_init__(self) -> None:
         # Sums of larger distances would lose the digits of a limb.

@@ -6,7 +6,7 @@ import html
 import pathlib
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -51,10 +51,12 @@ class Choice:
         simulation: Options of the simulator. The reference is always ``standard``, on which
             the networks were trained.
         fabric: Fabric of garments that specify none.
+        start: Start time in the motion [s].
         frames: Maximum number of frames.
         fps: Frames per second.
         source_fps: True rate of a motion file [1/s], if its header is wrong or lacks it.
         skeleton: The ASF file of an AMC file, if it is in another folder.
+        up: Axis of a motion file that points up; found from its skeleton if omitted.
         joint_map: File of joint names for a motion file whose names are unknown.
     """
 
@@ -67,10 +69,12 @@ class Choice:
     shape: tuple[tuple[str, float], ...] = ()
     simulation: Simulation = dataclasses.field(default_factory=Simulation)
     fabric: str | None = None
+    start: float = 0.0
     frames: int = 150
     fps: float = 30.0
     source_fps: float | None = None
     skeleton: pathlib.Path | None = None
+    up: Literal["y", "z"] | None = None
     joint_map: pathlib.Path | None = None
 
 
@@ -159,9 +163,11 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     clip = prepare_motion(
         choice.motion,
         fps=choice.fps,
+        start=choice.start,
         frames=choice.frames,
         source_fps=choice.source_fps,
         skeleton=choice.skeleton,
+        up=choice.up,
         joint_map=choice.joint_map,
         body=body,
         shape=shape,

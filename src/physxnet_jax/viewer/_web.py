@@ -30,7 +30,7 @@ from ._maps import magnified
 from ._server import start_server
 from ._stage import Stage
 
-_MOTIONS = (".bvh", ".amc", ".npz", ".glb", ".gltf", ".vrma")
+_MOTIONS = (".bvh", ".amc", ".npz", ".pkl", ".glb", ".gltf", ".vrma")
 _MAP_SIZE = 192
 
 
