@@ -136,7 +136,7 @@ def corpus() -> list[tuple[str, str, bytes, Callable[[pathlib.Path], object]]]:
         ("no stage", "me.usda", b"#usda 1.0\n(", read_character),
         ("nested without end", "me.usda", b"#usda 1.0\n" + b'def "a" {\n' * 60_000, read_character),
         ("nested without end", "scene.toml", b"motion = " + b"[" * 5000, load_scene),
-        ("unknown effect", "scene.toml", b'motion = "walk"\n[also.magic]\n', load_scene),
+        ("unknown effect", "scene.toml", b'motion = "walk"\n[effects.magic]\n', load_scene),
         ("wrong kind of value", "scene.toml", b'motion = "walk"\nframes = "ten"\n', load_scene),
         ("unknown weights", "none", b"", lambda path: load_predictor(path.name)),
     ]  # fmt: skip

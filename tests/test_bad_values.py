@@ -251,8 +251,8 @@ def test_unparsable_toml_files_are_refused(tmp_path, text):
         f"fps = {10**400}",
         f"start = {10**400}",
         'joint_map = "\\u0000"',
-        f"[also.air]\nturbulence = {10**400}",
-        "[also.air]\nwind = [[1.0], [2.0], [3.0]]",
+        f"[effects.air]\nturbulence = {10**400}",
+        "[effects.air]\nwind = [[1.0], [2.0], [3.0]]",
         f"[effects.{'x' * 5000}]",
     ],
 )

@@ -14,6 +14,7 @@ from physxnet_jax.cli import parse
 from physxnet_jax.cli._configs import read_config
 from physxnet_jax.data import DatasetConfig, read_protocol
 from physxnet_jax.dressing import dress, load_scene
+from physxnet_jax.dressing._scene_file import SCENE_KEYS
 from physxnet_jax.evaluation import CASES, ActionError, means
 from physxnet_jax.garment import KINDS, TEMPLATES
 from physxnet_jax.models import list_weights, read_card
@@ -40,10 +41,12 @@ def test_simulation_page_code_runs_and_its_scene_file_loads(tmp_path):
     assert job.scene.garments[0].fabric.density == 0.07
 
 
-@pytest.mark.parametrize("name", [p.name for p in ROOT.glob("docs/*.md")] + ["README.md"])
-def test_every_documented_command_parses(name, monkeypatch):
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda p: p.stem)
+def test_every_documented_command_parses(path, monkeypatch):
     """Each line that begins with the command's name means something to it."""
-    path = ROOT / name if name == "README.md" else ROOT / "docs" / name
     text = path.read_text()
     lines = re.findall(r"^(?:\.venv/bin/)?physxnet (.*?)(?: +#.*)?$", text, re.M)
     for line in lines:
@@ -60,9 +63,46 @@ def test_each_row_of_the_pains_page_has_a_valid_command():
 
 
 def test_every_relative_link_exists():
-    for path in [ROOT / "README.md", *ROOT.glob("docs/*.md")]:
+    for path in PAGES:
         for link in re.findall(r"\]\((?!https?:|#)([^)#]+)", path.read_text()):
             assert (path.parent / link).exists(), f"{path.name}: {link}"
+
+
+def test_reference_pages_are_those_that_the_program_makes():
+    made = runpy.run_path(str(ROOT / "docs/generate.py"))
+    pages = made["pages"]()
+    assert {p.name for p in (ROOT / "docs/reference").iterdir()} == set(pages)
+    for name, text in pages.items():
+        assert (ROOT / "docs/reference" / name).read_text() == text, (
+            f"python docs/generate.py: {name}"
+        )
+    # Every option and every setting is described.
+    blank = [
+        row
+        for name in ("cli.md", "scene-files.md")
+        for row in pages[name].splitlines()
+        if re.match(r"\| `(--)?[\w-]+` \|", row) and row.endswith("|  |")
+    ]
+    assert not blank
+
+
+def test_the_scene_schema_fits_the_program(tmp_path):
+    """What the schema names is read, and what it doesn't is refused."""
+    schema = json.loads((ROOT / "docs/reference/scene.schema.json").read_text())
+    effects = schema["properties"]["effects"]["properties"]
+    lines = ['motion = "walk"', "frames = 2", "standard = false"]
+    for name, entry in effects.items():
+        lines.append(f"[effects.{name}]")
+        for key, field in entry["properties"].items():
+            if field.get("default") not in (None, []):
+                lines.append(f"{key} = {json.dumps(field['default'])}")
+    path = tmp_path / "scene.toml"
+    path.write_text("\n".join(lines))
+    assert {type(e) for e in load_scene(path).scene.effects} == set(EFFECTS.values())
+    text = (ROOT / "docs/reference/scene-files.md").read_text()
+    path.write_text(re.search(r"```toml\n(.*?)```", text, re.S).group(1))
+    assert load_scene(path).scene.garments[0].fabric.density == 0.4
+    assert set(schema["properties"]) == set(SCENE_KEYS)
 
 
 def test_documented_joint_map_is_valid(tmp_path):

@@ -30,7 +30,7 @@ _SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[0] / "samples.py"))
 BVH, ASF, AMC = (_SAMPLES[name] for name in ("BVH", "ASF", "AMC"))
 OBJ = "o a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 1\nvt 0 0\nvt 1 1\nf 1/1 2/2 3/1\nf 2 4 3\nf -1 -2 -3 -4\n"
 SCENE = (
-    'motion = "balance"\nframes = 2\ngarments = ["bottom"]\n[also.air]\nwind = [0.0, 0.0, 4.0]\n'
+    'motion = "balance"\nframes = 2\ngarments = ["bottom"]\n[effects.air]\nwind = [0.0, 0.0, 4.0]\n'
 )
 PLY = (
     b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\n"

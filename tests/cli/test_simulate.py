@@ -31,9 +31,26 @@ from physxnet_jax.evaluation._price import Price
 from physxnet_jax.garment import FABRICS, square_sheet, template
 from physxnet_jax.io import write_obj
 from physxnet_jax.motion import body_animation, load_motion
-from physxnet_jax.simulation import XPBD, Effect, Rollout, Scene, prepare_scene, simulate_batch
+from physxnet_jax.simulation import (
+    STANDARD,
+    XPBD,
+    Effect,
+    Rollout,
+    Scene,
+    prepare_scene,
+    simulate_batch,
+)
 from physxnet_jax.simulation.blender import find_blender
-from physxnet_jax.simulation.effects import Air, BodyContact, Gravity, LayerContact, Pin, Stretch
+from physxnet_jax.simulation.effects import (
+    Air,
+    BodyContact,
+    Floor,
+    Gravity,
+    LayerContact,
+    Membrane,
+    Pin,
+    Stretch,
+)
 
 TOML = """
 motion = "balance"
@@ -42,7 +59,7 @@ accuracy = "draft"
 [[garments]]
 file = "bottom"
 fabric = "silk"
-[also.air]
+[effects.air]
 wind = [0, 0, 4]
 """
 
@@ -91,8 +108,16 @@ def test_scene_files_define_garments_effects_and_motion(tmp_path):
     assert job.scene.garments[0].fabric.density == 0.07
     assert Air(wind=(0.0, 0.0, 4.0)) in job.scene.effects
     assert job.motion.num_frames == 4 and job.accuracy == "draft"
-    path.write_text('motion = "walk"\n[effects.gravity]\n[effects.stretch]\ncompression = 1\n')
+    listed = "[effects.gravity]\n[effects.stretch]\ncompression = 1\n"
+    path.write_text(f'motion = "walk"\nstandard = false\n{listed}')
     assert load_scene(path).scene.effects == (Gravity(), Stretch(compression=1.0))
+    path.write_text(f'motion = "walk"\ngarments = ["bottom"]\n{listed}')
+    added = load_scene(path).scene.effects
+    assert [type(e) for e in added] == [type(e) for e in STANDARD]
+    assert Stretch(compression=1.0) in added
+    path.write_text('motion = "walk"\ngarments = ["bottom"]\n[effects.membrane]\n[effects.floor]\n')
+    kinds = {type(e) for e in load_scene(path).scene.effects}
+    assert {Membrane, Floor} <= kinds and Stretch not in kinds, "one law of stretching"
     both = make_scene("walk", ["top", "bottom"])
     assert [g.name for g in both.scene.garments] == ["bottom", "top"], "the innermost first"
     assert LayerContact() in both.scene.effects
@@ -100,6 +125,21 @@ def test_scene_files_define_garments_effects_and_motion(tmp_path):
 
 class Sway(Effect):
     """A custom effect."""
+
+
+def test_fabrics_of_scene_files_may_be_numbers(tmp_path):
+    path, copy = tmp_path / "scene.toml", tmp_path / "copy.toml"
+    path.write_text(
+        'motion = "walk"\nframes = 2\n[[garments]]\nfile = "bottom"\n'
+        'fabric = {base = "silk", density = 0.3, thickness = 0.01}\n'
+    )
+    read = load_scene(path)
+    fabric = read.scene.garments[0].fabric
+    assert (fabric.density, fabric.thickness) == (0.3, 0.01)
+    assert fabric.stretch == FABRICS["silk"].stretch
+    write_scene(copy, read, read.scene.effects)
+    again = load_scene(copy)
+    assert again.scene.garments[0].fabric == fabric and again.scene.effects == read.scene.effects
 
 
 def test_scenes_keep_custom_effects_and_refuse_duplicates():
@@ -210,19 +250,25 @@ def test_motions_are_simulated_at_the_requested_rate():
         ('motion = "walk"\nsource_fps = -1', "source_fps is -1"),
         ('motion = "a.amc"\nskeleton = 3', "skeleton can't be 3"),
         ('motion = "walk"\nwear = ["top"]', "unknown key wear"),
-        ('motion = "walk"\n[also.rain]', "no effect 'rain'"),
-        ('motion = "walk"\n[also.air]\nstorm = 1', "air has no 'storm'"),
-        ('motion = "walk"\n[also.stretch]\ncompression = 0', "stretch: compression is 0"),
-        ('motion = "walk"\n[also.membrane]\ncompression = -1', "membrane: compression is -1"),
+        ('motion = "walk"\n[effects.rain]', "no effect 'rain'"),
+        ('motion = "walk"\n[effects.air]\nstorm = 1', "air has no 'storm'"),
+        ('motion = "walk"\n[effects.stretch]\ncompression = 0', "stretch: compression is 0"),
+        ('motion = "walk"\n[effects.membrane]\ncompression = -1', "membrane: compression is -1"),
         (
-            'motion = "walk"\n[also.body_contact]\nhops = 2.5',
+            'motion = "walk"\n[effects.body_contact]\nhops = 2.5',
             "hops is 2.5, expected a whole number",
         ),
-        ('motion = "walk"\n[also.body_contact]\nhops = true', "hops is True, expected a whole"),
+        ('motion = "walk"\n[effects.body_contact]\nhops = true', "hops is True, expected a whole"),
         ('motion = "walk"\n[shape]\nself = 1', "Unknown shape parameter"),
         ('motion = "walk"\naccuracy = "best"', "draft, standard, fine"),
         ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = "tin"', "cotton"),
         ('motion = "walk"\n[[garments]]\nname = "top"', "file and fabric"),
+        ('motion = "walk"\nup = "x"', "up is y or z"),
+        ('motion = "walk"\nstandard = 1', "standard can't be 1"),
+        ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = {hue = 1}', "no 'hue'"),
+        ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = {bend = -1}', "bend is -1"),
+        ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = {bend = "soft"}', "a number"),
+        ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = {base = "tin"}', "cotton"),
     ],
 )
 def test_wrong_scene_files_are_refused_with_a_fix(tmp_path, text, says):
@@ -298,7 +344,7 @@ def test_effects_command_prints_and_writes_its_table(tmp_path, capsys, monkeypat
     path, rows = tmp_path / "scene.toml", tmp_path / "rows.json"
     path.write_text(
         'motion = "balance"\nframes = 2\naccuracy = "draft"\ngarments = ["bottom"]\n'
-        "[effects.gravity]\n[effects.body_contact]\n"
+        "standard = false\n[effects.gravity]\n[effects.body_contact]\n"
     )
     measured = []
 

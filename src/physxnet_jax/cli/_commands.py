@@ -34,7 +34,7 @@ class Dress:
     """
 
     motion: tyro.conf.Positional[str]
-    """A .bvh, .amc, .glb, .gltf, .vrma or .npz file, or a built-in clip (see `physxnet clips`)."""
+    """A .bvh, .amc, .glb, .gltf, .vrma, .npz or .pkl file, or a built-in clip (`physxnet clips`)."""
     method: Literal["guided", "network", "lbs", "simulate"] = "guided"
     """guided (a network, and a few substeps of simulation drawn to it), network (without those),
     lbs (skinning alone) or simulate (the teacher)."""
@@ -261,7 +261,7 @@ class View:
     """
 
     motion: tyro.conf.Positional[str] = "walk"
-    """A .bvh, .amc, .vrma, .glb, .gltf or .npz file, or a built-in clip (see `physxnet clips`)."""
+    """A .bvh, .amc, .glb, .gltf, .vrma, .npz or .pkl file, or a built-in clip (`physxnet clips`)."""
     method: Literal["guided", "network", "lbs", "simulate"] = "guided"
     """network, guided, lbs (skinning alone) or simulate."""
     compare: bool = False

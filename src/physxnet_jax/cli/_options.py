@@ -64,6 +64,9 @@ class EffectOptions:
     """Steady wind [m/s]."""
     self_contact: bool = False
     """Let garments collide with themselves."""
+    floor: bool | None = None
+    """Whether there is a floor; by default where a garment reaches down to it, or the person
+    kneels, sits or lies."""
 
     def build(self) -> "Simulation":
         """Builds the options of the Python API."""

@@ -9,7 +9,10 @@ from ._character import (
     make_character as make_character,
     write_dressed_character as write_dressed_character,
 )
-from ._character_file import read_character as read_character
+from ._character_file import (
+    CHARACTER_FORMATS as CHARACTER_FORMATS,
+    read_character as read_character,
+)
 from ._clothe import (
     Clothed as Clothed,
     Stream as Stream,
@@ -45,6 +48,7 @@ from ._scene_file import (
     make_scene as make_scene,
     write_scene as write_scene,
 )
+from ._scene_schema import attribute_notes as attribute_notes, scene_schema as scene_schema
 from ._simulate import (
     EXTERNAL_ENGINES as EXTERNAL_ENGINES,
     Simulation as Simulation,

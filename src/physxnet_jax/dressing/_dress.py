@@ -26,7 +26,7 @@ from ._character import (
 from ._dresser import Dresser, dress_garments, move_to_body
 from ._inference import Inference
 from ._meshes import Wear, animated_meshes, resolve_garments
-from ._simulate import EXTERNAL_ENGINES, Simulation, build_scene, run_simulation
+from ._simulate import EXTERNAL_ENGINES, Simulation, build_scene, run_simulation, with_floor
 from ._stages import Stage, timed
 from .postprocess import make_colliders
 
@@ -35,6 +35,8 @@ METHODS: tuple[Method, ...] = ("network", "guided", "lbs", "simulate")
 INFERENCE_STAGES = ("skinning", "network", "guided simulation")
 """Names of the stages in which cloth is inferred."""
 Progress = Callable[[str, int, int], None]
+# A character's lowest point within this of 0 stands on the floor at 0 [m].
+_ON_FLOOR = 0.05
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -146,6 +148,9 @@ def dress(
     clear_caches_if_full()
     person = _load_person(motion, body, shape, fps, start, frames, stages)
     garments, notes = _load_garments(wear, person, method, stages)
+    if method in ("guided", "simulate"):
+        where = garments, person.body, person.shape, person.clip.motion, person.floor
+        simulation = with_floor(simulation, *where)
     dresser = _make_dresser(garments, person, method, inference, simulation, stages)
     if method == "simulate":
         cloth = _simulate_cloth(garments, person, simulation, stages, progress)
@@ -162,6 +167,14 @@ class _Person:
     shape: Float[Array, " shapes"] | None
     clip: PosedClip
     character: Character | None
+
+    @property
+    def floor(self) -> float:
+        """Height of the floor [m]: that of a character's lowest point, if it isn't near 0."""
+        if self.character is None:
+            return 0.0
+        lowest = float(self.character.mesh.positions[..., 1].min())
+        return lowest if abs(lowest) > _ON_FLOOR else 0.0
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -5,25 +5,26 @@ import json
 import pathlib
 import tomllib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from jaxtyping import Array, Float
 
 from ..body import load_body
 from ..errors import FormatError
 from ..files import atomic_write, is_file
-from ..garment import FABRICS, Garment, parse_wear, with_default_fabric, with_fabric
+from ..garment import Garment, fabric_of, parse_wear, with_default_fabric, with_fabric
 from ..io import split_part
 from ..motion import Motion, prepare_motion, sudden_turns
 from ..simulation import EFFECTS, PRESETS, Accuracy, Effect, Scene
 from ._meshes import Wear, resolve_garments
-from ._simulate import Simulation, build_scene
+from ._simulate import Simulation, build_scene, with_floor
 
 # Larger integers are never valid settings and may not convert to float.
 _MAX_INTEGER = 10**12
-_KEYS: dict[str, type | tuple[type, ...]] = {
+SCENE_KEYS: dict[str, type | tuple[type, ...]] = {
     "motion": str,
     "source_fps": (int, float),
+    "up": str,
     "skeleton": str,
     "joint_map": str,
     "fps": (int, float),
@@ -32,9 +33,10 @@ _KEYS: dict[str, type | tuple[type, ...]] = {
     "accuracy": str,
     "garments": list,
     "shape": dict,
+    "standard": bool,
     "effects": dict,
-    "also": dict,
 }
+"""Keys of a scene file, and the types of their values."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +47,7 @@ class SceneFile:
         scene: Garments, effects and shape.
         motion: The body's motion.
         accuracy: ``draft``, ``standard``, ``fine`` or ``reference``.
-        lists_effects: Whether a file lists effects.
+        lists_effects: Whether a file names effects.
         keys: Keys of a scene file that state the motion and the garments; empty if they were
             given as objects.
         notes: Remarks on the motion and on garments read from files.
@@ -72,11 +74,12 @@ def write_scene(path: str | pathlib.Path, scene_file: SceneFile, effects: Sequen
     """
     if not scene_file.keys:
         raise FormatError("A scene of objects in memory can't be written; name clips and files.")
-    keys = {**scene_file.keys, "accuracy": scene_file.accuracy}
+    keys = {**scene_file.keys, "accuracy": scene_file.accuracy, "standard": False}
     tables = {k: v for k, v in keys.items() if isinstance(v, dict)}
     lines = [f"{k} = {json.dumps(v)}" for k, v in keys.items() if k not in tables | {"garments": 0}]
     for garment in keys["garments"]:
-        lines += ["", "[[garments]]", *(f"{k} = {json.dumps(v)}" for k, v in garment.items())]
+        lines += ["", "[[garments]]"]
+        lines += [f"{k} = {_toml(v)}" for k, v in garment.items()]
     names = {kind: name for name, kind in EFFECTS.items()}
     for name, table in tables.items():
         lines += ["", f"[{name}]", *(f"{k} = {json.dumps(v)}" for k, v in table.items())]
@@ -88,6 +91,12 @@ def write_scene(path: str | pathlib.Path, scene_file: SceneFile, effects: Sequen
                 lines.append(f"{field.name} = {json.dumps(value)}")
     with atomic_write(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k} = {json.dumps(v)}" for k, v in value.items()) + "}"
+    return json.dumps(value)
 
 
 def _scene_keys(
@@ -128,6 +137,7 @@ def make_scene(
     start: float = 0.0,
     frames: int | None = None,
     source_fps: float | None = None,
+    up: Literal["y", "z"] | None = None,
     skeleton: str | pathlib.Path | None = None,
     joint_map: str | pathlib.Path | None = None,
     shape: Float[Array, " shapes"] | None = None,
@@ -143,6 +153,7 @@ def make_scene(
         start: Start time within the motion [s].
         frames: Keep only this many frames.
         source_fps: True frame rate of a motion file [1/s], if its header lacks it or is wrong.
+        up: Axis of a motion file that points up; found from its skeleton if omitted.
         skeleton: The ASF file of an AMC file, if it is in another folder.
         joint_map: File that maps joint names, for a motion file with unknown ones.
         shape: Shape parameters; the default shape if omitted.
@@ -160,10 +171,12 @@ def make_scene(
         start=start,
         frames=frames,
         source_fps=source_fps,
+        up=up,
         skeleton=skeleton,
         joint_map=joint_map,
     )
     garments, notes = resolve_garments(wear, body, shape)
+    simulation = with_floor(simulation, garments, body, shape, clip)
     scene = build_scene(garments, body, shape, simulation, also)
     fault = sudden_turns(body, clip)
     options = {
@@ -171,6 +184,7 @@ def make_scene(
         "start": start,
         "frames": frames,
         "source_fps": source_fps,
+        "up": up,
         "skeleton": skeleton,
         "joint_map": joint_map,
     }
@@ -196,19 +210,19 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         source_fps = 120           # if the file's header lacks the rate or is wrong
         skeleton = "02.asf"        # of an AMC file, if it is in another folder
         joint_map = "names.toml"   # only for a file with unknown joint names
-        garments = ["bottom", "top"]
+        garments = ["trousers", "shirt"]
         start = 0.5                # seconds
         frames = 60
         accuracy = "standard"
 
         [[garments]]               # instead of the list, to choose fabrics
-        file = "top"
-        fabric = "silk"
+        file = "shirt"
+        fabric = "silk"            # or numbers: {density = 0.15, stretch = 300.0}
 
-        [also.air]                 # in addition to `standard_effects`
+        [effects.air]              # in addition to the standard ones; alone with standard = false
         wind = [0.0, 0.0, 4.0]
 
-        [effects.gravity]          # or list all effects, in place of the standard ones
+    docs/scene-files.md lists every key with its unit and default.
 
     Raises:
         FormatError: The file isn't TOML, or has an unknown key, effect or setting.
@@ -219,43 +233,50 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
     places = [_resolve_path(path, g["file"]) for g in words]
     worn, notes = resolve_garments(places, load_body(), shape)
     garments = [
-        with_fabric(w, g["fabric"]) if "fabric" in g else w
+        with_fabric(w, fabric_of(g["fabric"])) if "fabric" in g else w
         for w, g in zip(worn, words, strict=True)
     ]
+    listed = _parse_effects(path, text.get("effects", {}))
+    standard = text.get("standard", True)
     scene_file = make_scene(
         _resolve_path(path, text["motion"]),
         garments,
         fps=float(text.get("fps", 30.0)),
         source_fps=text.get("source_fps"),
         skeleton=_resolve_path(path, text["skeleton"]) if "skeleton" in text else None,
+        up=text.get("up"),
         joint_map=_resolve_path(path, text["joint_map"]) if "joint_map" in text else None,
         start=float(text.get("start", 0.0)),
         frames=min((n for n in (frames, text.get("frames")) if n is not None), default=None),
         simulation=Simulation(
             accuracy=text.get("accuracy", "standard"),
-            effects=tuple(_parse_effects(path, text["effects"])) if "effects" in text else None,
+            effects=None if standard else tuple(listed),
         ),
         shape=shape,
-        also=_parse_effects(path, text.get("also", {})),
+        also=listed if standard else (),
     )
+    numbers = [isinstance(g.get("fabric"), dict) for g in words]
     files = [
-        with_default_fabric([str(place)], g.get("fabric"))[0]
-        for place, g in zip(places, words, strict=True)
+        with_default_fabric([str(place)], None if n else g.get("fabric"))[0]
+        for place, g, n in zip(places, words, numbers, strict=True)
     ]
     options = {
         k: _resolve_path(path, v) if k in ("skeleton", "joint_map") else v
         for k, v in text.items()
-        if k in ("fps", "start", "frames", "source_fps", "skeleton", "joint_map", "shape")
+        if k in ("fps", "start", "frames", "source_fps", "up", "skeleton", "joint_map", "shape")
     }
+    keys = _scene_keys(_resolve_path(path, text["motion"]), files, options)
+    for entry, g, n in zip(keys["garments"], words, numbers, strict=True):
+        entry |= {"fabric": g["fabric"]} if n else {}
     return dataclasses.replace(
         scene_file,
-        keys=_scene_keys(_resolve_path(path, text["motion"]), files, options),
+        keys=keys,
         notes=(*scene_file.notes, *notes),
-        lists_effects="effects" in text or "also" in text,
+        lists_effects=bool(listed),
     )
 
 
-def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, str]]]:
+def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """The checked keys of a scene file, and its garments as tables."""
     if not is_file(path):
         raise FormatError(f"{path}: no such file. Check the path.")
@@ -265,13 +286,14 @@ def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, str]
     # TOMLDecodeError is a ValueError; Python also raises ValueError for numbers it refuses.
     except (ValueError, RecursionError) as error:
         raise FormatError(f"{path}: not a scene in TOML: {error}.") from None
-    unknown = sorted(set(text) - set(_KEYS))
+    unknown = sorted(set(text) - set(SCENE_KEYS))
     if unknown or "motion" not in text:
         wrong = f"unknown key {unknown[0]}" if unknown else "no key motion"
-        raise FormatError(f"{path}: {wrong}; a scene has {', '.join(_KEYS)}.")
+        raise FormatError(f"{path}: {wrong}; a scene has {', '.join(SCENE_KEYS)}.")
     for key, value in text.items():
         huge = isinstance(value, int) and abs(value) > _MAX_INTEGER
-        if not isinstance(value, _KEYS[key]) or isinstance(value, bool) or huge:
+        misplaced = isinstance(value, bool) and SCENE_KEYS[key] is not bool
+        if not isinstance(value, SCENE_KEYS[key]) or misplaced or huge:
             raise FormatError(f"{path}: {key} can't be {value!r}"[:300] + ".")
     wrong = [k for k, v in text.get("shape", {}).items() if not isinstance(v, int | float)]
     if wrong:
@@ -279,6 +301,8 @@ def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, str]
     for key in ("fps", "source_fps"):
         if not 0 < float(text.get(key, 30.0)) <= 1e4:
             raise FormatError(f"{path}: {key} is {text[key]}, expected a positive number.")
+    if text.get("up") not in (None, "y", "z"):
+        raise FormatError(f"{path}: up is y or z.")
     if text.get("accuracy", "standard") not in PRESETS:
         raise FormatError(f"{path}: accuracy is one of {', '.join(PRESETS)}.")
     words = [
@@ -287,14 +311,15 @@ def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, str]
     ]
     for g in words:
         keys = set(g) if isinstance(g, dict) else {str(g)}
-        if keys - {"file", "fabric"} or not all(isinstance(x, str) for x in g.values()):
-            raise FormatError(
-                f"{path}: a garment takes the strings file and fabric, not {', '.join(keys)}."
-            )
+        if keys - {"file", "fabric"} or not isinstance(g.get("file", ""), str):
+            raise FormatError(f"{path}: a garment takes file and fabric, not {', '.join(keys)}.")
         if "file" not in g:
             raise FormatError(f"{path}: a garment has no file.")
-        if "fabric" in g and g["fabric"] not in FABRICS:
-            raise FormatError(f"{path}: no fabric '{g['fabric']}'; there are {', '.join(FABRICS)}.")
+        if "fabric" in g:
+            try:
+                fabric_of(g["fabric"])
+            except (TypeError, ValueError) as error:
+                raise FormatError(f"{path}: {error}"[:300] + ".") from None
     return text, words
 
 

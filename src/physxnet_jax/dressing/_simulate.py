@@ -24,12 +24,13 @@ from ..simulation import (
     Rollout,
     Scene,
     Solver,
+    needs_floor,
     prepare_scene,
     simulate_batch,
     standard_effects,
 )
 from ..simulation.blender import simulate_blender
-from ..simulation.effects import Air, Damping, SelfContact
+from ..simulation.effects import Air, Bend, Damping, Dihedral, Floor, Membrane, SelfContact, Stretch
 from ..simulation.newton import simulate_newton
 from ._stages import Stage
 from .postprocess import layer_order
@@ -54,6 +55,8 @@ class Simulation:
             run out of process (PHYSXNET_BLENDER, PHYSXNET_NEWTON).
         wind: Steady wind [m/s].
         self_contact: Whether garments collide with themselves.
+        floor: Whether there is a floor, or its height [m], 0 by default; if None, there is one
+            where a garment reaches down to it or the person kneels, sits or lies.
         effects: Effects that replace the standard ones.
         substeps: Steps a frame at 30 frames per second, in place of those of ``accuracy``; 8 for
             a guided simulation.
@@ -67,6 +70,7 @@ class Simulation:
     engine: Literal["xpbd", "bdf2", "blender", "newton"] = "xpbd"
     wind: tuple[float, float, float] | None = None
     self_contact: bool = False
+    floor: bool | float | None = None
     effects: tuple[Effect, ...] | None = None
     substeps: int | None = None
     refine: float | None = None
@@ -83,6 +87,7 @@ class Simulation:
             "accuracy": self.accuracy != "standard",
             "wind": self.wind is not None,
             "self_contact": self.self_contact,
+            "floor": self.floor is not None,
             "substeps": self.substeps is not None,
         }
         given = [name for name, is_set in options.items() if is_set]
@@ -110,7 +115,10 @@ class Simulation:
     def also(self) -> tuple[Effect, ...]:
         """Effects requested in addition to the others."""
         wind = () if self.wind is None else (Air(wind=self.wind),)
-        return (*wind, *((SelfContact(),) if self.self_contact else ()))
+        contact = (SelfContact(),) if self.self_contact else ()
+        if self.floor is None or self.floor is False:
+            return (*wind, *contact)
+        return (*wind, *contact, Floor(0.0 if self.floor is True else self.floor))
 
 
 def build_scene(
@@ -130,7 +138,34 @@ def build_scene(
         also: Additional effects; each replaces an effect of the same type.
     """
     ordered = layer_order(garments)
+    simulation = with_floor(simulation, ordered, body, shape)
     return Scene(tuple(ordered), _active_effects(simulation, ordered, also), body, shape)
+
+
+def with_floor(
+    simulation: Simulation,
+    garments: Sequence[Garment],
+    body: Body | None,
+    shape: Float[Array, " shapes"] | None,
+    motion: Motion | None = None,
+    height: float = 0.0,
+) -> Simulation:
+    """Decides whether there is a floor, where the options leave it open.
+
+    Args:
+        simulation: The options.
+        garments: The garments.
+        body: The body; the built-in one if None.
+        shape: Shape parameters; the default shape if None.
+        motion: The motion, which may call for a floor; none if None.
+        height: Height of its floor [m].
+    """
+    external = simulation.engine in EXTERNAL_ENGINES
+    if simulation.floor is not None or simulation.effects is not None or external:
+        return simulation
+    if not needs_floor(garments, body, shape, motion, height):
+        return dataclasses.replace(simulation, floor=False)
+    return dataclasses.replace(simulation, floor=height or True)
 
 
 def _active_effects(
@@ -140,9 +175,10 @@ def _active_effects(
     if simulation.effects is not None:
         return _merge_effects(simulation.effects, also)
     acting = standard_effects(garments)
-    if any(isinstance(e, Air) for e in also):
-        # Damping models still air, so air would act twice with both.
-        acting = tuple(e for e in acting if not isinstance(e, Damping))
+    # Damping models still air; springs and triangles both resist stretching: one of each acts.
+    others = {Air: Damping, Membrane: Stretch, Dihedral: Bend}
+    replaced = tuple(old for new, old in others.items() if any(isinstance(e, new) for e in also))
+    acting = tuple(e for e in acting if not isinstance(e, replaced))
     return _merge_effects(acting, also)
 
 

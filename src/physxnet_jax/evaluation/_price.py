@@ -22,7 +22,7 @@ from ..simulation import (
     prepare_scene,
     simulate_batch,
 )
-from ..simulation.effects import Air, BodyContact, Damping, LayerContact, Pin, SelfContact
+from ..simulation.effects import Air, BodyContact, Damping, Floor, LayerContact, Pin, SelfContact
 from ._penetration import penetration
 from ._strain import edge_strain
 
@@ -164,7 +164,7 @@ def recommend_effects(
     """Measures which effects matter for a scene.
 
     The scene's effects are left out one by one (`price_effects`). Drag of still air,
-    self-contact and layer contact are added one by one if the scene lacks them.
+    self-contact, a floor and layer contact are added one by one if the scene lacks them.
 
     Args:
         scene: The scene.
@@ -180,6 +180,8 @@ def recommend_effects(
     extra: list[Effect] = [Air()] if Air not in kinds else []
     if SelfContact not in kinds:
         extra.append(SelfContact())
+    if Floor not in kinds:
+        extra.append(Floor())
     if LayerContact not in kinds and len(scene.garments) > 1:
         extra.append(LayerContact())
     total = 1 + len(scene.effects) + len(extra)

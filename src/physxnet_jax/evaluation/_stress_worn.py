@@ -41,7 +41,7 @@ SLID = "slid along the body (mm)"
 
 
 def _run(motion: Motion, name: Template = "top") -> Rollout:
-    return simulate_batch(prepare_scene(Scene((template(name),), STANDARD)), [motion])[0]
+    return simulate_batch(Scene((template(name),), STANDARD), [motion])[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +124,7 @@ def run_own(
     peer = PEER_CASES[name]
     garments, motion = peer.garments(), peer.motion()
     effects = standard_effects(garments) if effects is None else effects
-    (out,) = simulate_batch(prepare_scene(Scene(garments, effects)), [motion])
+    (out,) = simulate_batch(Scene(garments, effects), [motion])
     seen = outcome(garments, motion, np.concatenate(out.positions, axis=1), peer.bounds)
     return out, iter([(k, peer.bounds[k], seen[k]) for k in peer.bounds])
 

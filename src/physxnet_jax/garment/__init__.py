@@ -57,6 +57,7 @@ from ._templates import (
 )
 from ._wear import (
     WearItem as WearItem,
+    fabric_of as fabric_of,
     parse_wear as parse_wear,
     with_default_fabric as with_default_fabric,
     with_fabric as with_fabric,

@@ -3,10 +3,11 @@
 import dataclasses
 import pathlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ..errors import PhysXNetError
-from ._garment import FABRICS, TEMPLATES, Garment, Template
+from ._garment import FABRICS, TEMPLATES, Fabric, Garment, Template
 from ._search import AXES, UNITS
 from .tailoring import KINDS, MEASURES
 
@@ -132,12 +133,42 @@ def with_default_fabric(words: Sequence[str], fabric: str | None) -> tuple[str, 
     return tuple(out)
 
 
-def with_fabric(garment: Garment, fabric: str) -> Garment:
-    """Replaces the fabric of a garment by name.
+def fabric_of(settings: str | Mapping[str, Any]) -> Fabric:
+    """A fabric by its name, or by numbers.
+
+    Args:
+        settings: A name in `FABRICS`, or attributes of `Fabric`; ``base`` names the fabric
+            of which the others are taken, cotton by default.
+
+    Raises:
+        ValueError: An unknown fabric or attribute, or a value that it can't have.
+
+    Example:
+        >>> fabric_of({"base": "jersey", "density": 0.2}).stretch
+        400.0
+    """
+    if isinstance(settings, str):
+        settings = {"base": settings}
+    numbers = dict(settings)
+    base = numbers.pop("base", "cotton")
+    if base not in FABRICS:
+        raise ValueError(f"no fabric '{base}'; there are {', '.join(FABRICS)}")
+    known = [f.name for f in dataclasses.fields(Fabric)]
+    unknown = sorted(set(numbers) - set(known))
+    if unknown:
+        raise ValueError(f"a fabric has no '{unknown[0]}'; it has base, {', '.join(known)}")
+    for name, value in numbers.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError(f"fabric: {name} is {value!r}, expected a number")
+    return dataclasses.replace(FABRICS[base], **{k: float(v) for k, v in numbers.items()})
+
+
+def with_fabric(garment: Garment, fabric: str | Fabric) -> Garment:
+    """Replaces the fabric of a garment, by name or by its parameters.
 
     The thickness doesn't fall below the garment's own, because its gap to the skin depends on
     the coarseness of its mesh and on what it lies over, not on the fabric alone.
     """
-    cloth = FABRICS[fabric]
+    cloth = FABRICS[fabric] if isinstance(fabric, str) else fabric
     thickness = max(cloth.thickness, garment.fabric.thickness)
     return dataclasses.replace(garment, fabric=dataclasses.replace(cloth, thickness=thickness))

@@ -31,6 +31,7 @@ from ._scene import (
     STANDARD as STANDARD,
     Scene as Scene,
     make_system as make_system,
+    needs_floor as needs_floor,
     prepare_scene as prepare_scene,
     standard_effects as standard_effects,
 )

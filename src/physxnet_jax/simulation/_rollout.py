@@ -125,7 +125,7 @@ def simulate(
 
 
 def simulate_batch(
-    scene: PreparedScene,
+    scene: Scene | PreparedScene,
     motions: list[Motion],
     *,
     solver: Solver | None = None,
@@ -140,7 +140,7 @@ def simulate_batch(
     of a batch of such a share.
 
     Args:
-        scene: The prepared scene.
+        scene: The scene, or a prepared one, which saves the time of preparing it again.
         motions: Clips with the same frame rate. Shorter ones hold their last pose.
         solver: Solver of the cloth; ``standard`` by default.
         progress: Called with the number of frames done and the total.
@@ -160,6 +160,8 @@ def simulate_batch(
     if not motions:
         raise SimulationError("No motion to simulate; pass at least one.")
     clear_caches_if_full()
+    if isinstance(scene, Scene):
+        scene = prepare_scene(scene)
     used = min(len(jax.local_devices()), len(motions)) if devices is None else devices
     missing = -len(motions) % max(used, 1)
     mesh = make_mesh(len(motions) + missing, used, local=True)

@@ -9,10 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..body import Body, load_body
+from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..devices import on_processor, prepared_on_processor
 from ..errors import SimulationError
 from ..garment import Garment
+from ..motion import Motion
 from ._assembly import assemble, float32
 from ._effect import Effect
 from ._prepared_scene import PreparedScene
@@ -25,6 +26,7 @@ from .effects import (
     Damping,
     Dihedral,
     Elastic,
+    Floor,
     Gravity,
     Guide,
     LayerContact,
@@ -51,6 +53,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "self_contact": SelfContact,
     "layer_contact": LayerContact,
     "body_contact": BodyContact,
+    "floor": Floor,
     "pin": Pin,
 }
 """All effects by name, in the recommended order."""
@@ -64,6 +67,38 @@ STANDARD: tuple[Effect, ...] = (
     Pin(),
 )
 """Default effects for the clothes of a moving person, in their order of application."""
+
+
+# Cloth this near to the soles of the standing body meets the floor when it walks [m].
+_NEAR_FLOOR = 0.05
+# Hips lower than this share of their standing height: the person kneels, sits or lies.
+_LOW = 0.65
+
+
+def needs_floor(
+    garments: Sequence[Garment],
+    body: Body | None = None,
+    shape: Float[Array, " shapes"] | None = None,
+    motion: Motion | None = None,
+    height: float = 0.0,
+) -> bool:
+    """Whether a garment reaches down to the floor, or the person's hips come near to it.
+
+    Args:
+        garments: The garments.
+        body: The body; the built-in one if None.
+        shape: Shape parameters; the default if None.
+        motion: The motion; none if None.
+        height: Height of its floor [m].
+    """
+    body = load_body() if body is None else body
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    soles = float(np.asarray(rest)[:NUM_BODY_VERTICES, 1].min())
+    hems = (float(np.asarray(g.rest_vertices(rest))[:, 1].min()) for g in garments)
+    if min(hems, default=np.inf) < soles + _NEAR_FLOOR:
+        return True
+    standing = float(body.joint_positions(rest)[0][0, 1]) - soles
+    return motion is not None and bool(np.min(motion.root[:, 1]) < height + _LOW * standing)
 
 
 def standard_effects(garments: Sequence[Garment]) -> tuple[Effect, ...]:

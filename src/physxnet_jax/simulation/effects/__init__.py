@@ -6,6 +6,7 @@ from ._contact import BodyContact as BodyContact
 from ._damping import Damping as Damping
 from ._dihedral import Dihedral as Dihedral
 from ._elastic import Elastic as Elastic
+from ._floor import Floor as Floor
 from ._gravity import Gravity as Gravity
 from ._guide import Guide as Guide, PreparedGuide as PreparedGuide
 from ._layers import LayerContact as LayerContact
