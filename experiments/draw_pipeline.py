@@ -52,7 +52,7 @@ def main() -> None:
     high = min(len(maps), len(mesh))
     iio.imwrite("docs/pipeline.png", np.concatenate([maps[:high], mesh[:high]], axis=1))
     walk = dress("walk", ["shirt", "trousers"], frames=60)
-    render_preview("docs/demo.png", walk.meshes, walk.fps, size=(240, 416))
+    render_preview("docs/demo.png", walk.meshes, walk.fps, size=(240, 416), strip=6)
     render_preview("docs/walk.gif", walk.meshes, walk.fps, size=(240, 320))
 
 

@@ -14,6 +14,7 @@ from ._options import (
     MotionSource,
     Outfit,
     Output,
+    PreviewOptions,
     QuietTerminal,
     SimulationOptions,
     Terminal,
@@ -34,7 +35,7 @@ class Dress:
     """
 
     motion: tyro.conf.Positional[str]
-    """A .bvh, .amc, .glb, .gltf, .vrma, .npz or .pkl file, or a built-in clip (`physxnet clips`)."""
+    """A .bvh, .amc, .glb, .gltf, .vrma, .npz or .pkl file, or a clip of `physxnet clips`."""
     method: Literal["guided", "network", "lbs", "simulate"] = "guided"
     """guided (a network, and a few substeps of simulation drawn to it), network (without those),
     lbs (skinning alone) or simulate (the teacher)."""
@@ -48,6 +49,7 @@ class Dress:
     inference: InferenceOptions = dataclasses.field(default_factory=InferenceOptions)
     simulation: SimulationOptions = dataclasses.field(default_factory=SimulationOptions)
     output: Output = dataclasses.field(default_factory=Output)
+    picture: PreviewOptions = dataclasses.field(default_factory=PreviewOptions)
     terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
@@ -70,6 +72,7 @@ class Simulate:
     person: BodyOptions = dataclasses.field(default_factory=BodyOptions)
     simulation: SimulationOptions = dataclasses.field(default_factory=SimulationOptions)
     output: Output = dataclasses.field(default_factory=Output)
+    picture: PreviewOptions = dataclasses.field(default_factory=PreviewOptions)
     terminal: Terminal = dataclasses.field(default_factory=Terminal)
 
 
@@ -261,7 +264,7 @@ class View:
     """
 
     motion: tyro.conf.Positional[str] = "walk"
-    """A .bvh, .amc, .glb, .gltf, .vrma, .npz or .pkl file, or a built-in clip (`physxnet clips`)."""
+    """A .bvh, .amc, .glb, .gltf, .vrma, .npz or .pkl file, or a clip of `physxnet clips`."""
     method: Literal["guided", "network", "lbs", "simulate"] = "guided"
     """network, guided, lbs (skinning alone) or simulate."""
     compare: bool = False

@@ -32,6 +32,7 @@ from ._options import (
     MotionSource,
     Outfit,
     Output,
+    PreviewOptions,
     changed,
     check_body,
     check_simulates,
@@ -66,7 +67,7 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
     check_body(command.person, command.source)
     output = command.output
     pictures = [p for p in (output.preview, still) if p is not None]
-    _check_files(output.out, pictures, console)
+    _check_files(output.out, pictures, command.picture, console)
     with progress_bars(console) as progress:
         selected = choose(command, progress)
         options: dict[str, Any] = {
@@ -78,7 +79,7 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
         job = _job(
             command.motion, command.source, command.outfit, command.person, options, progress
         )
-        clip, written, _ = _run(job, output, pictures, progress)
+        clip, written, _ = _run(job, output, pictures, command.picture, progress)
     if command.terminal.json:
         choice = {} if selected is None else {"picked": selected.summary}
         print_json(report(clip) | choice | {"files": written})
@@ -96,7 +97,7 @@ def run_simulate(command: Simulate, console: Console) -> int:
     check_body(command.person, command.source)
     output = command.output
     pictures = [] if output.preview is None else [output.preview]
-    _check_files(output.out, pictures, console)
+    _check_files(output.out, pictures, command.picture, console)
     first = output.out or output.preview
     resume_folder = None if first is None else first.with_name(f".{first.name}.unfinished")
     with progress_bars(console) as progress:
@@ -109,7 +110,7 @@ def run_simulate(command: Simulate, console: Console) -> int:
             )
         simulation = dataclasses.replace(job.simulation, resume=resume_folder)
         job = dataclasses.replace(job, simulation=simulation)
-        clip, written, seconds = _run(job, output, pictures, progress)
+        clip, written, seconds = _run(job, output, pictures, command.picture, progress)
     if command.terminal.json:
         files = {"notes": [*job.notes, *clip.notes], "files": written}
         print_json(rollout_report(clip, seconds) | files)
@@ -237,7 +238,11 @@ def _job(
 
 
 def _run(
-    job: _Job, output: Any, pictures: list[pathlib.Path], progress: _Progress
+    job: _Job,
+    output: Output,
+    pictures: list[pathlib.Path],
+    look: PreviewOptions,
+    progress: _Progress,
 ) -> tuple[DressedClip, list[pathlib.Path], float]:
     motion = job.motion if isinstance(job.motion, Motion) else job.motion.motion
     if output.out is not None:
@@ -266,7 +271,8 @@ def _run(
         else:
             written += write_clip(output.out, clip.meshes, clip.fps)
     for picture in pictures:
-        written.append(render_preview(picture, clip.meshes, clip.fps, progress=progress))
+        options = dataclasses.asdict(look)
+        written.append(render_preview(picture, clip.meshes, clip.fps, progress=progress, **options))
     return clip, written, seconds
 
 
@@ -276,12 +282,19 @@ def _keeps_rig(person: Character, output: Output) -> bool:
     return bool(out and out.suffix.lower() == ".glb" and output.body and person.rig)
 
 
-def _check_files(out: pathlib.Path | None, pictures: list[pathlib.Path], console: Console) -> None:
+def _check_files(
+    out: pathlib.Path | None,
+    pictures: list[pathlib.Path],
+    look: PreviewOptions,
+    console: Console,
+) -> None:
     """Checks before the computation that all files can be written."""
+    if not pictures and changed(look):
+        raise PhysXNetError(f"{changed(look)[0]} is for pictures: add --preview FILE.")
     if out is not None:
         check_output(out)
     for picture in pictures:
-        check_preview(picture)
+        check_preview(picture, look.size, look.background, look.strip)
     if out is None and not pictures:
         console.print(UNWRITTEN)
 

@@ -163,6 +163,21 @@ class Output:
 
 
 @dataclasses.dataclass(frozen=True)
+class PreviewOptions:
+    """Preview."""
+
+    size: tuple[int, int] = (480, 544)
+    """Width and height of the preview; multiples of 16 for .mp4."""
+    camera: Literal["three-quarter", "front", "follow", "turntable"] = "three-quarter"
+    """three-quarter and front keep their direction, follow turns with the person, turntable goes
+    around once; all keep the person in the middle."""
+    background: str = "studio"
+    """studio, white, grey, dark or #rrggbb."""
+    strip: int = 1
+    """Number of moments side by side in a .png."""
+
+
+@dataclasses.dataclass(frozen=True)
 class _Debug:
     debug: bool = False
     """Show the traceback of an error."""

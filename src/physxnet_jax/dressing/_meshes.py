@@ -2,6 +2,8 @@
 
 import dataclasses
 import pathlib
+import re
+import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,7 +22,11 @@ Wear = Sequence[Garment | str | pathlib.Path] | Garment | str | pathlib.Path
 Names take options after a colon, see `parse_wear`.
 """
 
-_COLOURS = ((0.16, 0.27, 0.55), (0.55, 0.28, 0.20), (0.25, 0.45, 0.30), (0.45, 0.25, 0.45))
+# Display colours as sRGB: of known garments, and of others by their name.
+_OWN = {"shirt": 0x6A8FBF, "top": 0x6A8FBF, "tee": 0xC9CED6, "trousers": 0x4A4F5C}
+_OWN |= {"bottom": 0x4A4F5C, "shorts": 0x7A6A55, "skirt": 0x5E8F78, "dress": 0xA8505A}
+_OWN |= {"aline": 0xA8505A}
+_OTHERS = (0x8A6FA8, 0xB8934A, 0x4F8F96, 0x8F9A4E, 0x9A5F86, 0x5A74B0)
 _SKIN_COLOUR = (0.69, 0.46, 0.33)
 
 
@@ -55,15 +61,27 @@ def animated_meshes(
                 _SKIN_COLOUR,
             )
         )
-    for k, g in enumerate(garments):
+    taken: set[int] = set()
+    for g in garments:
         uv = None if g.mesh.uv is None else np.asarray(g.mesh.uv)
         uv_faces = None if g.mesh.uv_faces is None else np.asarray(g.mesh.uv_faces)
-        colour = _COLOURS[k % len(_COLOURS)]
+        colour = _garment_colour(g.name, taken)
         faces = np.asarray(g.mesh.faces)
         meshes.append(
             AnimatedMesh(g.name, positions[g.name], faces, uv, uv_faces, colour, g.polygons)
         )
     return tuple(meshes)
+
+
+def _garment_colour(name: str, taken: set[int]) -> tuple[float, float, float]:
+    """Linear colour of a garment: by its name, unless another one has that colour."""
+    kinds = [k for k in _OWN if re.match(rf"{k}(?![a-z])", name.lower())]
+    first = zlib.crc32(name.encode()) % len(_OTHERS)
+    choices = [*(_OWN[k] for k in kinds[:1]), *_OTHERS[first:], *_OTHERS[:first]]
+    code = next((c for c in choices if c not in taken), choices[0])
+    taken.add(code)
+    r, g, b = ((code >> shift & 255) / 255 for shift in (16, 8, 0))
+    return r**2.2, g**2.2, b**2.2
 
 
 def resolve_garments(

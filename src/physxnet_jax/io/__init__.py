@@ -2,6 +2,7 @@
 
 from ._animated_mesh import (
     AnimatedMesh as AnimatedMesh,
+    Look as Look,
     StaticMesh as StaticMesh,
     smooth_normals as smooth_normals,
 )
