@@ -89,11 +89,11 @@ SOFT = ("moon walk", "balancing", "walking")
 ABRUPT = ("strong gesture", "jump", "punch")
 COPIED = (
     *("oracle", "accuracy_cost", "peers", "engines", "training"),
-    *("blender_import", "layers", "adapt", "unseen"),
+    *("blender_import", "blender_extension", "layers", "adapt", "unseen"),
 )
 DOCUMENTS = (
     *("docs/reproduction.md", "docs/accuracy-cost.md", "docs/garments.md"),
-    *("docs/stability.md", "README.md"),
+    *("docs/stability.md", "docs/blender.md", "README.md"),
 )
 
 

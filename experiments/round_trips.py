@@ -18,7 +18,7 @@ import numpy as np
 import pygltflib
 import trimesh
 from jaxtyping import Float
-from pxr import Usd, UsdGeom
+from pxr import Usd, UsdGeom, UsdSkel
 
 from physxnet_jax.dressing import dress
 from physxnet_jax.files import atomic_write
@@ -40,8 +40,25 @@ def usd(files: list[pathlib.Path], meshes: list[AnimatedMesh]) -> Read:
     for m in meshes:
         prim = UsdGeom.Mesh(stage.GetPrimAtPath(f"/Person/{m.name}"))
         index = np.asarray(prim.GetFaceVertexIndicesAttr().Get())
-        points = [np.asarray(prim.GetPointsAttr().Get(k)) for k in range(len(m.positions))]
-        yield m, np.stack(points)[:, index]
+        skin = UsdSkel.BindingAPI(prim.GetPrim()).GetInheritedSkeleton()
+        if skin:
+            frames = [_skinned(prim, skin, k) for k in range(len(m.positions))]
+        else:
+            frames = [np.asarray(prim.GetPointsAttr().Get(k)) for k in range(len(m.positions))]
+        yield m, np.stack(frames)[:, index]
+
+
+def _skinned(prim: UsdGeom.Mesh, skeleton: UsdSkel.Skeleton, frame: int) -> np.ndarray:
+    """Points as USD's own library skins them."""
+    cache = UsdSkel.Cache()
+    root = UsdSkel.Root(prim.GetPrim().GetParent())
+    cache.Populate(root, Usd.PrimDefaultPredicate)
+    query = cache.GetSkinningQuery(prim.GetPrim())
+    transforms = cache.GetSkelQuery(skeleton).ComputeSkinningTransforms(frame)
+    points = prim.GetPointsAttr().Get(frame)
+    # In place.
+    assert query.ComputeSkinnedPoints(transforms, points, frame)
+    return np.asarray(points)
 
 
 def glb(files: list[pathlib.Path], meshes: list[AnimatedMesh]) -> Read:

@@ -557,3 +557,28 @@ def test_an_obj_is_a_person_who_stands_still(tmp_path):
     person = read_character(tmp_path / "a.obj")
     assert person[0].positions.shape == (1, len(POINTS), 3)
     np.testing.assert_allclose(np.ptp(person[0].positions[0, :, 1]), 1.7, atol=1e-5)
+
+
+def test_the_body_of_a_stage_is_a_skeleton_with_one_mesh(tmp_path):
+    """It moves as its vertices do, in a file that doesn't hold them."""
+    usd = pytest.importorskip("pxr.Usd")
+    from pxr import UsdSkel
+
+    from physxnet_jax.dressing import dress
+
+    clip = dress("walk", ["bottom"], method="lbs", frames=12)
+    (path,) = write_clip(tmp_path / "a.usdc", clip.meshes, 30.0)
+    whole = read_character(path, fps=30.0, mesh="body").mesh.positions
+    np.testing.assert_allclose(whole, clip.meshes[0].positions, atol=3e-6)
+    stage = usd.Stage.Open(str(path))
+    points = stage.GetPrimAtPath("/Person/body").GetAttribute("points")
+    assert points.GetNumTimeSamples() == 0
+    assert stage.GetPrimAtPath("/Person").IsA(UsdSkel.Root)
+    skeleton = UsdSkel.Skeleton(stage.GetPrimAtPath("/Person/body_skeleton"))
+    assert len(skeleton.GetJointsAttr().Get()) == 31
+    # What isn't skinned alone is written point by point.
+    cloth = stage.GetPrimAtPath("/Person/bottom").GetAttribute("points")
+    assert cloth.GetNumTimeSamples() == 12
+    plain = dataclasses.replace(clip.meshes[0], skinning=None)
+    (baked,) = write_clip(tmp_path / "b.usdc", [plain], 30.0)
+    assert baked.stat().st_size > 1.5 * path.stat().st_size

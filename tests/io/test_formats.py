@@ -110,7 +110,7 @@ def test_gltf_refuses_clips_with_too_many_frames(tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "a.glb").exists()
     # And before anything is computed.
     monkeypatch.setattr("physxnet_jax.io._gltf.MAX_FRAMES", 20)
-    monkeypatch.setattr("physxnet_jax.dressing.dress", None)
+    monkeypatch.setattr("physxnet_jax.cli._dress.dress", None)
     assert main(["dress", "walk", "--wear", "bottom", "-o", str(tmp_path / "b.html")]) == 2
     assert "too many for glTF" in capsys.readouterr().err
 

@@ -274,9 +274,16 @@ def test_usd_stores_normals_extent_and_velocities_of_every_frame(tmp_path, clip)
     usd = pytest.importorskip("pxr.Usd")
     from pxr import UsdGeom
 
-    (path,) = write_clip(tmp_path / "a.usdc", clip, 24.0)
+    (path,) = write_clip(tmp_path / "a.usdc", clip, 24.0, velocities=True)
     stage = usd.Stage.Open(str(path))
     prims = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+    (lean,) = write_clip(tmp_path / "b.usdc", clip, 24.0)
+    stage_without = usd.Stage.Open(str(lean))
+    assert not any(
+        UsdGeom.Mesh(p).GetVelocitiesAttr().HasAuthoredValue()
+        for p in stage_without.Traverse()
+        if p.IsA(UsdGeom.Mesh)
+    )
     for m, prim in zip(clip, prims, strict=True):
         mesh = UsdGeom.Mesh(prim)
         for k, x in enumerate(m.positions):

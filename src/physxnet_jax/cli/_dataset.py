@@ -16,6 +16,7 @@ from ..data import (
     list_sequences,
     read_sequence,
     read_times,
+    write_protocol,
 )
 from ..errors import FormatError
 from ..evaluation import Finding, check_sequence, skinning
@@ -33,7 +34,25 @@ _TILE = (220, 260)
 
 def dataset(command: Dataset, console: Console) -> int:
     """Builds or checks a dataset; returns 1 if a check finds a problem."""
+    if command.what == "template":
+        return _template(command, console)
     return _build(command, console) if command.what == "build" else _check(command, console)
+
+
+def _template(command: Dataset, console: Console) -> int:
+    """Writes a table of the motions in a folder."""
+    with progress_bars(console) as progress:
+        path, unread = write_protocol(command.target, progress)
+    for line in unread:
+        console.print(f"left out: {line}", highlight=False, markup=False)
+    console.print(
+        f"wrote {path}: check splits, starts and lengths, then"
+        f" physxnet dataset build CONFIG --mocap {command.target} --out FOLDER",
+        highlight=False,
+    )
+    if command.terminal.json:
+        print_json({"files": [path], "left_out": unread})
+    return 0
 
 
 def _build(command: Dataset, console: Console) -> int:

@@ -15,6 +15,7 @@ from ..dressing import (
     DressedClip,
     Inference,
     Simulation,
+    Stage,
     dress,
     load_character,
     load_scene,
@@ -26,6 +27,7 @@ from ..models import read_card
 from ..motion import Motion, load_motion
 from ..viewer import check_preview, render_preview
 from ._calibrate import choose
+from ._clock import lap
 from ._commands import Demo, Dress, Effects, Simulate
 from ._options import (
     BodyOptions,
@@ -59,6 +61,7 @@ class _Job:
     fps: float
     start: float
     notes: tuple[str, ...] = ()
+    stages: tuple[Stage, ...] = ()
 
 
 def run_dress(command: Dress, console: Console, still: pathlib.Path | None = None) -> int:
@@ -68,7 +71,7 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
     output = command.output
     pictures = [p for p in (output.preview, still) if p is not None]
     _check_files(output.out, pictures, command.picture, console)
-    with progress_bars(console) as progress:
+    with progress_bars(console, lines=command.terminal.progress) as progress:
         selected = choose(command, progress)
         options: dict[str, Any] = {
             "method": command.method,
@@ -100,7 +103,7 @@ def run_simulate(command: Simulate, console: Console) -> int:
     _check_files(output.out, pictures, command.picture, console)
     first = output.out or output.preview
     resume_folder = None if first is None else first.with_name(f".{first.name}.unfinished")
-    with progress_bars(console) as progress:
+    with progress_bars(console, lines=command.terminal.progress) as progress:
         if is_scene_file(command.scene):
             job = _scene_job(command)
         else:
@@ -199,6 +202,7 @@ def _job(
     progress: _Progress,
 ) -> _Job:
     """Loads the motion, and the character that it drives."""
+    begun = Stage("starting", lap())
     shape = load_body().shape(**parse_shape(person.shape)) if person.shape else None
     word = with_animation(word, source)
     motion: Any = None
@@ -226,6 +230,7 @@ def _job(
             progress=progress,
         )
     defaults = {"inference": Inference(), "simulation": Simulation()}
+    loaded = Stage("loading" if custom is None else "loading the character", lap())
     return _Job(
         motion=motion,
         wear=outfit.words,
@@ -233,6 +238,7 @@ def _job(
         frames=source.frames,
         fps=source.fps,
         start=0.0 if custom is not None else source.start,
+        stages=(begun, loaded),
         **(defaults | options),
     )
 
@@ -263,17 +269,22 @@ def _run(
     )
     seconds = time.perf_counter() - began
     written: list[pathlib.Path] = []
+    files: list[Stage] = []
+    ticks = time.perf_counter()
     if output.out is not None:
         person = job.motion
         if isinstance(person, Character) and _keeps_rig(person, output):
             person = person.after(job.start)
             written.append(write_dressed_character(output.out, person, clip.garments))
         else:
-            written += write_clip(output.out, clip.meshes, clip.fps)
+            written += write_clip(output.out, clip.meshes, clip.fps, velocities=output.velocities)
+        files.append(Stage("writing", 1e3 * (time.perf_counter() - ticks)))
     for picture in pictures:
+        ticks = time.perf_counter()
         options = dataclasses.asdict(look)
         written.append(render_preview(picture, clip.meshes, clip.fps, progress=progress, **options))
-    return clip, written, seconds
+        files.append(Stage("preview", 1e3 * (time.perf_counter() - ticks)))
+    return dataclasses.replace(clip, stages=(*job.stages, *clip.stages, *files)), written, seconds
 
 
 def _keeps_rig(person: Character, output: Output) -> bool:

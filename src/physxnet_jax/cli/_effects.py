@@ -12,6 +12,7 @@ from ..files import check_writable, write_json
 from ..simulation import PRESETS
 from ._commands import Effects
 from ._dress import is_scene_file, scene_file
+from ._options import with_animation
 from ._progress import print_json, progress_bars
 
 
@@ -25,11 +26,13 @@ def price(command: Effects, console: Console) -> int:
     if is_scene_file(command.scene):
         job = scene_file(command)
     else:
+        source = dataclasses.asdict(command.source)
+        del source["animation"]
         job = make_scene(
-            command.scene,
+            with_animation(command.scene, command.source),
             command.outfit.words,
             simulation=command.simulation.build(),
-            **dataclasses.asdict(command.source),
+            **source,
         )
     solver = PRESETS[command.simulation.accuracy or job.accuracy].at_rate(job.motion.fps)
     with progress_bars(console) as bars:

@@ -98,10 +98,12 @@ class Dataset:
       physxnet dataset check runs/ours --contact-sheet out/ours.png
     """
 
-    what: tyro.conf.Positional[Literal["build", "check"]]
-    """build: simulate. check: look for explosions, penetration, jitter, wrong counts."""
+    what: tyro.conf.Positional[Literal["build", "check", "template"]]
+    """build: simulate. check: look for explosions, penetration, jitter, wrong counts. template:
+    write ACTIONS.csv for a folder of motion files."""
     target: tyro.conf.Positional[str]
-    """build: a configuration, FILE.toml or FILE.toml#TABLE. check: a dataset's folder."""
+    """build: a configuration, FILE.toml or FILE.toml#TABLE. check: a dataset's folder. template:
+    the folder of motion files."""
     out: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
     """build: the dataset's folder, or a URL that tensorstore takes (s3://, gs://)."""
     mocap: pathlib.Path | None = None
@@ -139,6 +141,8 @@ class Train:
     """The run's folder: checkpoints, metrics.jsonl, TensorBoard events, weights."""
     splits: tuple[str, ...] = ("train",)
     """Splits of the datasets to train on."""
+    validation: tuple[str, ...] | None = None
+    """Names of actions that are held out for validation, in place of the configuration's."""
     steps: int | None = None
     """Stop after this many steps in total."""
     devices: int | None = None

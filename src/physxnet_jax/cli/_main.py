@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 
 from ..errors import BrokenInstallError, PhysXNetError
+from ._clock import start
 from ._commands import (
     Calibrate,
     Clips,
@@ -74,6 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         `dataset check`, `doctor` or ``--strict`` finds a problem; 2 for an error in the input;
         130 if interrupted by Ctrl-C; 141 if the reader of the output closed the pipe.
     """
+    start()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         print_help(Console(highlight=False))

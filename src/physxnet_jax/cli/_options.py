@@ -123,13 +123,15 @@ class Outfit:
     and skirts, these over trousers; among garments of one type, later ones are outer."""
     fabric: Fabric | None = None
     """Fabric of all garments that don't name one."""
+    made_on: pathlib.Path | None = None
+    """Mesh of the body that the garment files were made on, in the same place as they."""
 
     @property
     def words(self) -> tuple[str, ...]:
-        """The garments, with the default fabric for those that don't name one."""
-        from ..garment import with_default_fabric
+        """The garments, with the default fabric and body for those that don't name one."""
+        from ..garment import with_default_fabric, with_made_on
 
-        return with_default_fabric(self.wear, self.fabric)
+        return with_made_on(with_default_fabric(self.wear, self.fabric), self.made_on)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +160,8 @@ class Output:
     """Image or video: .png, .gif or .mp4."""
     body: bool = True
     """Include the body in the result."""
+    velocities: bool = False
+    """USD: include velocities of the garments, for motion blur."""
     strict: bool = False
     """Exit with code 1 if a simulated garment slides off the body."""
 
@@ -197,6 +201,8 @@ class QuietTerminal(_Debug):
 
     quiet: bool = False
     """Print errors only."""
+    progress: bool = False
+    """Print progress as lines of JSON on stderr, for other programs."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """Output: progress bars with the remaining time, and JSON."""
 
 import contextlib
+import json
+import sys
 from collections.abc import Callable, Iterator
 
 from rich.console import Console
@@ -13,8 +15,18 @@ UNWRITTEN = "nothing will be written: name a file with -o or --preview"
 
 
 @contextlib.contextmanager
-def progress_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]:
-    """Yields a function that takes a stage, the steps done and the number of steps."""
+def progress_bars(
+    console: Console, *, lines: bool = False
+) -> Iterator[Callable[[str, int, int], None]]:
+    """Yields a function that takes a stage, the steps done and the number of steps.
+
+    Args:
+        console: Where bars are drawn, if it is a terminal.
+        lines: Print lines of JSON on stderr instead.
+    """
+    if lines:
+        yield _print_line
+        return
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -32,6 +44,11 @@ def progress_bars(console: Console) -> Iterator[Callable[[str, int, int], None]]
             bar.update(tasks[name], completed=done)
 
         yield progress
+
+
+def _print_line(name: str, done: int, total: int) -> None:
+    line = json.dumps({"stage": name, "done": done, "total": total})
+    print(line, file=sys.stderr, flush=True)  # noqa: T201
 
 
 def print_json(values: object) -> None:

@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from ..dressing import DressedClip, Simulation
+from ..dressing import DressedClip, Simulation, Stage
+from ..motion import BLOCK
 from ..simulation import Status
 
 
@@ -17,22 +18,29 @@ def closing_table(clip: DressedClip) -> list[Table]:
         title_justify="left",
     )
     times.add_column("stage")
+    times.add_column("whole (ms)", justify="right")
     times.add_column("first call (ms)", justify="right")
     times.add_column("warm (ms a frame)", justify="right")
     for stage in clip.stages:
-        warm = "" if stage.warm_ms is None else f"{stage.warm_ms:.2f}"
-        times.add_row(stage.name, f"{stage.cold_ms:.0f}", warm)
+        whole = f"{_milliseconds(clip, stage):.0f}"
+        by_frames = stage.warm_ms is not None
+        first = f"{stage.cold_ms:.0f}" if by_frames else ""
+        times.add_row(stage.name, whole, first, f"{stage.warm_ms:.2f}" if by_frames else "")
+    times.add_row("total", f"{sum(_milliseconds(clip, s) for s in clip.stages):.0f}", "", "")
     fit = Table(title="garments, and their share inside the body", title_justify="left")
     for name in (
         "garment",
         "vertices",
         "rays hit",
         "fallbacks",
-        "inside, raw",
+        "raw",
         "inside",
         "worst frame",
     ):
-        fit.add_column(name, justify="left" if name == "garment" else "right")
+        if name == "garment":
+            fit.add_column(name, overflow="fold")
+        else:
+            fit.add_column(name, justify="right", no_wrap=True)
     for m in clip.garments:
         fit.add_row(
             m.name,
@@ -44,6 +52,13 @@ def closing_table(clip: DressedClip) -> list[Table]:
             _worst(clip, m.name),
         )
     return [times, fit]
+
+
+def _milliseconds(clip: DressedClip, stage: Stage) -> float:
+    """Time of a whole stage [ms]: of its first block, and of the others at its usual pace."""
+    if stage.warm_ms is None:
+        return stage.cold_ms
+    return stage.cold_ms + stage.warm_ms * max(clip.num_frames - BLOCK, 0)
 
 
 def report(clip: DressedClip) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """`physxnet train`: a network from a configuration and datasets."""
 
+import dataclasses
 import math
 
 from rich.console import Console
@@ -20,6 +21,8 @@ def train(command: Train, console: Console) -> int:
     """Starts or resumes training; writes the weights to the run's folder."""
     first = join_processes(command.coordinator, command.num_processes, command.process_id) == 0
     config = read_config(command.config, TrainConfig)
+    if command.validation is not None:
+        config = dataclasses.replace(config, validation=command.validation)
     entries = [
         entry
         for root in command.data

@@ -28,6 +28,7 @@ from ._protocol import (
     left_out as left_out,
     load_action as load_action,
     read_protocol as read_protocol,
+    write_protocol as write_protocol,
 )
 from ._store import (
     QUANTIZATION_STEP as QUANTIZATION_STEP,

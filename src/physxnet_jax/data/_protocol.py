@@ -10,7 +10,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..errors import MotionError
+from ..errors import MotionError, PhysXNetError
+from ..files import atomic_write
 from ..motion import Motion, load_motion, sample
 
 FPS = 30.0
@@ -106,6 +107,59 @@ def read_protocol(folder: str | pathlib.Path) -> list[Action]:
             )
         seen[action.slug] = action.name
     return actions
+
+
+_COLUMNS = ("split", "action", "file", "start_s", "frames_at_30fps", "note")
+_MOTIONS = (".bvh", ".amc", ".npz", ".pkl", ".glb", ".gltf", ".vrma")
+# Of so many motions one is a test action.
+_TEST_EVERY = 5
+
+
+def write_protocol(
+    folder: str | pathlib.Path, progress: Callable[[str, int, int], None] | None = None
+) -> tuple[pathlib.Path, tuple[str, ...]]:
+    """Writes ``ACTIONS.csv`` for a folder of motion files, to be edited.
+
+    Every file becomes an action over its whole length; every fifth is a test action.
+
+    Args:
+        folder: The folder; files in folders below it count too.
+        progress: Called with a stage, the files done and the total.
+
+    Returns:
+        The table, and a line for each file that isn't read.
+
+    Raises:
+        MotionError: There is a table already, or no motion that can be read.
+    """
+    folder = pathlib.Path(folder)
+    table = folder / "ACTIONS.csv"
+    if table.exists():
+        raise MotionError.at(table, None, "exists already", "Edit it, or move it away")
+    files = sorted(p for p in folder.rglob("*") if p.suffix.lower() in _MOTIONS)
+    rows, unread, taken = [], [], set()
+    for k, path in enumerate(files):
+        try:
+            clip = load_motion(path)
+        except (PhysXNetError, OSError) as error:
+            unread.append(str(error))
+            continue
+        name = re.sub(r"[^A-Za-z0-9]+", " ", path.stem).strip() or f"motion {k}"
+        while name.lower() in taken:
+            name += " again"
+        taken.add(name.lower())
+        split = "test" if len(rows) % _TEST_EVERY == _TEST_EVERY - 1 else "train"
+        frames = max(1, int(clip.num_frames * 30.0 / clip.fps))
+        rows.append((split, name, path.relative_to(folder).as_posix(), 0, frames, ""))
+        if progress is not None:
+            progress("motions", k + 1, len(files))
+    if not rows:
+        raise MotionError.at(folder, None, "no motion that can be read", "Put motion files there")
+    with atomic_write(table) as part, part.open("w", newline="", encoding="utf-8") as out:
+        lines = csv.writer(out)
+        lines.writerow(_COLUMNS)
+        lines.writerows(rows)
+    return table, tuple(unread)
 
 
 def left_out(folder: str | pathlib.Path, actions: list[Action]) -> list[Action]:

@@ -54,6 +54,7 @@ from ._simulate import (
     Simulation as Simulation,
     run_simulation as run_simulation,
 )
+from ._stages import Stage as Stage
 from ._variations import (
     with_cut as with_cut,
     with_fabric as with_fabric,

@@ -93,7 +93,8 @@ def read_character(
     targets. ``.usd*``:
     points as time samples, or UsdSkel skins. ``.pc2``, ``.mdd``: caches, with the OBJ of
     their faces beside them. ``.npz``: ``positions``, ``faces`` and ``fps``; the first two may
-    have a mesh's name as prefix, as `write_clip` writes. Several meshes are joined, unless one
+    have a mesh's name as prefix, as `write_clip` writes, and ``bind`` may give a pose with limbs
+    apart. Several meshes are joined, unless one
     is called body: then only that one is read.
 
     Args:
@@ -222,8 +223,16 @@ def _read_npz(path: pathlib.Path, fps: float) -> tuple[list[SourceMesh], float |
                 f" '{prefix}faces' beside it."
             )
         _check_faces(path, faces, x.shape[1])
-        x = x.astype(np.float32, copy=False)
-        parts.append(SourceMesh(prefix.rstrip("_") or "body", x, faces.astype(np.int32)))
+        bind = data.get(f"{prefix}bind")
+        if bind is not None and (bind.shape != x.shape[1:] or not _numbers(bind)):
+            raise FormatError(f"{path}: '{prefix}bind' has shape {bind.shape}, not {x.shape[1:]}.")
+        part = SourceMesh(
+            prefix.rstrip("_") or "body",
+            x.astype(np.float32, copy=False),
+            faces.astype(np.int32),
+            bind=None if bind is None else bind.astype(np.float32),
+        )
+        parts.append(part)
     declared = data.get("fps")
     if declared is None:
         return parts, None, None

@@ -1,5 +1,6 @@
 """Dresses a motion in garments and returns animated meshes."""
 
+import concurrent.futures
 import dataclasses
 import pathlib
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from jaxtyping import Array, Float
 
 from .._environment import clear_caches_if_full
 from ..body import Body, load_body
+from ..devices import on_processor
 from ..errors import PhysXNetError
 from ..garment import Garment
 from ..io import AnimatedMesh
@@ -28,7 +30,7 @@ from ._inference import Inference
 from ._meshes import Wear, animated_meshes, resolve_garments
 from ._simulate import EXTERNAL_ENGINES, Simulation, build_scene, run_simulation, with_floor
 from ._stages import Stage, timed
-from .postprocess import make_colliders
+from .postprocess import BodyCollider, make_colliders
 
 Method = Literal["network", "guided", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "guided", "lbs", "simulate")
@@ -152,11 +154,15 @@ def dress(
         where = garments, person.body, person.shape, person.clip.motion, person.floor
         simulation = with_floor(simulation, *where)
     dresser = _make_dresser(garments, person, method, inference, simulation, stages)
-    if method == "simulate":
-        cloth = _simulate_cloth(garments, person, simulation, stages, progress)
-    else:
-        cloth = _infer_cloth(dresser, person.clip, stages, progress, on_block)
-    return _assemble_clip(dresser, person, cloth, method, include_body, notes, stages)
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        # Compiled while the cloth's own program is.
+        colliders = pool.submit(_colliders, dresser, person)
+        if method == "simulate":
+            cloth = _simulate_cloth(garments, person, simulation, stages, progress)
+        else:
+            cloth = _infer_cloth(dresser, person.clip, stages, progress, on_block)
+        measured = colliders.result()
+    return _assemble_clip(dresser, person, cloth, measured, method, include_body, notes, stages)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -299,10 +305,24 @@ def _infer_cloth(
     )
 
 
+def _colliders(dresser: Dresser, person: _Person) -> tuple[BodyCollider, ...]:
+    """Colliders by which penetration is measured, with their programs compiled."""
+    if person.character is not None:
+        return ()
+    with on_processor():
+        colliders = dresser.colliders
+        if colliders is None:
+            colliders = make_colliders(dresser.outfit)
+    for w, c in zip(dresser.worn, colliders, strict=True):
+        inside_shares(c, np.asarray(w.rest)[None], person.clip)
+    return tuple(colliders)
+
+
 def _assemble_clip(
     dresser: Dresser,
     person: _Person,
     cloth: _Cloth,
+    colliders: tuple[BodyCollider, ...],
     method: Method,
     include_body: bool,
     notes: tuple[str, ...],
@@ -319,9 +339,6 @@ def _assemble_clip(
                 for part in (raw, positions)
             )
         else:
-            colliders = dresser.colliders
-            if colliders is None:
-                colliders = make_colliders(dresser.outfit)
             inside_raw, inside = {}, {}
             for w, c in zip(dresser.worn, colliders, strict=True):
                 shares = inside_shares(c, positions[w.name], clip)

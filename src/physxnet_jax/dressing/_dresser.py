@@ -6,7 +6,7 @@ from typing import Literal
 from jaxtyping import Array, Float, Int
 
 from ..body import Body, load_body
-from ..devices import prepared_on_processor
+from ..devices import prepared_on_processor, side_by_side
 from ..errors import PhysXNetError, WeightsError
 from ..garment import Garment, SkinnedGarment, make_skinned
 from ..models import (
@@ -156,7 +156,12 @@ def dress_garments(
     else:
         predictor = with_body(_predictor(inference), body, rest)
         predictor = at_precision(predictor, precision)
-        worn = tuple(bind_to_predictor(predictor, body, rest, g) for g in garments)
+        own = predictor
+
+        def bound(g: Garment) -> BoundGarment:
+            return bind_to_predictor(own, body, rest, g)
+
+        worn = tuple(side_by_side(bound, garments))
     outfit, guided = Outfit(body, rest, worn, tuple(garments)), None
     if method == "guided":
         # The simulation has strain, contact and layers of its own.

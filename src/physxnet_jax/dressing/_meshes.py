@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float
 
-from ..body import Body
+from ..body import NUM_BODY_VERTICES, Body
 from ..errors import PhysXNetError
 from ..garment import Garment, load_outfit
-from ..io import AnimatedMesh
-from ..motion import Motion, body_animation
+from ..io import AnimatedMesh, Skinning
+from ..motion import Motion, body_animation, clip_transforms
 
 Wear = Sequence[Garment | str | pathlib.Path] | Garment | str | pathlib.Path
 """One or several garments, garment files, kinds of the tailor or templates.
@@ -59,6 +59,7 @@ def animated_meshes(
                 np.asarray(mesh.uv),
                 np.asarray(mesh.uv_faces),
                 _SKIN_COLOUR,
+                skinning=_skinning(body, clip, shape),
             )
         )
     taken: set[int] = set()
@@ -71,6 +72,20 @@ def animated_meshes(
             AnimatedMesh(g.name, positions[g.name], faces, uv, uv_faces, colour, g.polygons)
         )
     return tuple(meshes)
+
+
+def _skinning(body: Body, clip: Motion, shape: Any | None) -> Skinning:
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    rotations, translations = clip_transforms(body, rest, clip)
+    return Skinning(
+        np.asarray(rest)[:NUM_BODY_VERTICES],
+        np.asarray(body.joint_positions(rest)[0]),
+        tuple(body.joint_names),
+        tuple(body.parents),
+        np.asarray(body.weights)[:NUM_BODY_VERTICES],
+        rotations,
+        translations,
+    )
 
 
 def _garment_colour(name: str, taken: set[int]) -> tuple[float, float, float]:

@@ -61,6 +61,7 @@ from ._wear import (
     parse_wear as parse_wear,
     with_default_fabric as with_default_fabric,
     with_fabric as with_fabric,
+    with_made_on as with_made_on,
 )
 from .tailoring import (
     DEFAULT_KINDS as DEFAULT_KINDS,

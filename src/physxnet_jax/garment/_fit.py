@@ -1,6 +1,5 @@
 """Clearance between a garment and the skin at rest."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -24,7 +23,6 @@ from ..geometry import (
 _ROWS = 2048
 # Hanging cloth farther from the skin than this isn't lifted off it [m].
 _NEAR = 0.03
-_closest_among = jax.jit(closest_among)
 
 
 def clearance(
@@ -41,7 +39,7 @@ def clearance(
     pick = np.minimum(np.arange(-(-count // _ROWS) * _ROWS), count - 1)
     near = nearby_faces(vertices, faces, np.asarray(points))
     p = jnp.asarray(np.asarray(points)[pick], jnp.float32)
-    hit = _closest_among(body, p, jnp.asarray(near[pick]))
+    hit = closest_among(body, p, jnp.asarray(near[pick]))
     distance = np.asarray(signed_distance(body, p, closest=hit))[:count]
     normals = np.asarray(vertex_normals(body.vertices, body.faces))
     tri = faces[np.asarray(hit.face)[:count]]

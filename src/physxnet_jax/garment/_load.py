@@ -25,6 +25,7 @@ from ..io import GARMENT_FORMATS, StaticMesh, mesh_name, read_mesh, split_part
 from ._fit import clearance, lift_out
 from ._garment import COTTON, TEMPLATES, Garment, Template
 from ._locate import Hints, Placement, locate_on_body, nearest_skin
+from ._made_on import placed_by_body
 from ._openings import Opening, openings
 from ._poses import posed_bodies
 from ._templates import template
@@ -225,6 +226,10 @@ def place_mesh(item: WearItem, mesh: StaticMesh, body: Body) -> Placement:
     Raises:
         MeshError: Nothing places it on the body.
     """
+    if item.made_on is not None:
+        if item.unit or item.up or item.front:
+            raise PhysXNetError(f"{item.name}: made_on places it; leave unit, up and front out.")
+        return placed_by_body(item.name, mesh, item.made_on, body)
     hints = Hints(unit=item.unit, up=item.up, front=item.front)
     return locate_on_body(pathlib.Path(item.name), mesh, body, hints)
 

@@ -5,7 +5,6 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -242,7 +241,7 @@ def nearest_skin(
     """
     near = nearby_faces(np.asarray(skin.vertices), np.asarray(skin.faces), vertices, neighbours=12)
     points = padded_rows(vertices.astype(np.float32))
-    hit = jax.jit(closest_among)(skin, jnp.asarray(points), jnp.asarray(padded_rows(near)))
+    hit = closest_among(skin, jnp.asarray(points), jnp.asarray(padded_rows(near)))
     refs = skin.faces[hit.face]
     skin_weights = carried_weights(body.weights, refs, hit.weights)
     known = (refs, hit.weights, skin_weights, hit.squared_distance)

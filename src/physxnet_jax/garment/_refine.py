@@ -35,19 +35,20 @@ def refine_garment(garment: Garment, longest: float) -> Garment:
     corners[:n] = np.arange(n)[:, None]
     weights = _barycentric(x, x[corners])
     weights[:n] = [1.0, 0.0, 0.0]
-    share = jnp.asarray(weights.astype(np.float32))[:, :, None]
-    at = jnp.asarray(corners)
-    skin = jnp.sum(share * garment.skin[at], axis=1)
+    share = weights.astype(np.float32)[:, :, None]
+    skin = np.sum(share * np.asarray(garment.skin)[corners], axis=1)
+    ref_weights = (share * np.asarray(garment.ref_weights)[corners]).reshape(len(x), -1)
+    offset = np.sum(share * np.asarray(garment.offset)[corners], axis=1)
     held = np.asarray(garment.pinned)[corners] | (weights < _ROUNDING)
     own = garment.coarse_faces
     return dataclasses.replace(
         garment,
         mesh=mesh,
         pinned=jnp.asarray(held.all(axis=1)),
-        refs=garment.refs[at].reshape(len(x), -1),
-        ref_weights=(share * garment.ref_weights[at]).reshape(len(x), -1),
-        offset=jnp.sum(share * garment.offset[at], axis=1),
-        skin=skin / jnp.sum(skin, axis=1, keepdims=True),
+        refs=jnp.asarray(np.asarray(garment.refs)[corners].reshape(len(x), -1)),
+        ref_weights=jnp.asarray(ref_weights),
+        offset=jnp.asarray(offset),
+        skin=jnp.asarray(skin / skin.sum(axis=1, keepdims=True)),
         polygons=None,
         coarse_faces=garment.mesh.faces if own is None else own,
     )

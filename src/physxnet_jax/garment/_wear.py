@@ -11,7 +11,7 @@ from ._garment import FABRICS, TEMPLATES, Fabric, Garment, Template
 from ._search import AXES, UNITS
 from .tailoring import KINDS, MEASURES
 
-_PLACE = ("unit", "up", "front")
+_PLACE = ("unit", "up", "front", "made_on")
 _OPTIONS = re.compile(r"^(?P<name>.+?):(?P<options>\w+=[^:,=]*(?:,\w+=[^:,=]*)*)$")
 
 
@@ -25,6 +25,7 @@ class WearItem:
         unit: Unit of a file; found if None.
         up: The axis of a file that points up, one of ``x``, ``y``, ``z`` or their negatives.
         front: The axis of a file that the garment faces, likewise.
+        made_on: File of the body that the garment was made on, in the same place.
         fabric: Name of a fabric that replaces its own; None keeps it.
         measures: Measures of a tailored garment [m].
         hold: Curves of a tailored garment that are fixed to the body.
@@ -35,6 +36,7 @@ class WearItem:
     unit: str | None = None
     up: str | None = None
     front: str | None = None
+    made_on: str | None = None
     fabric: str | None = None
     measures: dict[str, float] = dataclasses.field(default_factory=dict)
     hold: tuple[str, ...] = ()
@@ -54,8 +56,9 @@ def parse_wear(word: str | pathlib.Path) -> WearItem:
     Args:
         word: A template, a kind of garment or a file, with its options: ``fabric``; for a file
             ``as``, its template, and ``unit``, ``up`` and ``front`` where they can't be found
-            (``up=z,front=-y``); for a tailored garment its measures [m] and ``hold``, curves
-            joined by ``+`` that are fixed to the body.
+            (``up=z,front=-y``), or ``made_on``, a mesh of the body that it was made on; for a
+            tailored garment its measures [m] and ``hold``, curves joined by ``+`` that are
+            fixed to the body.
 
     Raises:
         PhysXNetError: A key, template, fabric or number is wrong.
@@ -130,6 +133,24 @@ def with_default_fabric(words: Sequence[str], fabric: str | None) -> tuple[str, 
         item = parse_wear(word)
         joint = ":" if item.name == word else ","
         out.append(word if item.fabric else f"{word}{joint}fabric={fabric}")
+    return tuple(out)
+
+
+def with_made_on(words: Sequence[str], made_on: str | pathlib.Path | None) -> tuple[str, ...]:
+    """Adds the body that garment files were made on to the words of `parse_wear`.
+
+    Example:
+        >>> with_made_on(["top", "coat.obj:as=top"], "avatar.obj")
+        ('top', 'coat.obj:as=top,made_on=avatar.obj')
+    """
+    if made_on is None:
+        return tuple(words)
+    out = []
+    for word in words:
+        item = parse_wear(word)
+        own = item.name in KINDS or item.name in TEMPLATES or item.made_on
+        joint = ":" if item.name == word else ","
+        out.append(word if own else f"{word}{joint}made_on={made_on}")
     return tuple(out)
 
 

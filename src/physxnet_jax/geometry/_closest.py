@@ -1,6 +1,8 @@
 """Closest points on triangles, and signed distance to closed meshes."""
 
 import dataclasses
+import functools
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +15,7 @@ from ._normals import face_normals, vertex_normals
 from ._rotation import safe_normalize
 from ._topology import mesh_edges
 
+_A = TypeVar("_A", Array, np.ndarray)
 _FACE_CHUNK = 256
 # Derivatives of a quotient contain the inverse square of its denominator, which overflows
 # float32 below this value. Edges so short count as points, triangles so thin as lines.
@@ -36,15 +39,16 @@ class ClosestPoints:
 
 
 def closest_barycentric(
-    p: Float[Array, " 3 *batch"],
-    a: Float[Array, " 3 *batch"],
-    b: Float[Array, " 3 *batch"],
-    c: Float[Array, " 3 *batch"],
-) -> tuple[Float[Array, " 3 *batch"], Float[Array, "*batch"]]:
+    p: Float[_A, " 3 *batch"],
+    a: Float[_A, " 3 *batch"],
+    b: Float[_A, " 3 *batch"],
+    c: Float[_A, " 3 *batch"],
+) -> tuple[Float[_A, " 3 *batch"], Float[_A, "*batch"]]:
     """Barycentric coordinates of the point of triangle abc closest to p.
 
     The component axis comes first, so that the work is element-wise over the rest.
-    Values and gradients are finite for triangles degenerated to a line or a point.
+    Values and gradients are finite for triangles degenerated to a line or a point. NumPy arrays
+    give NumPy arrays, with nothing compiled.
 
     Args:
         p: Query points [m].
@@ -58,26 +62,27 @@ def closest_barycentric(
     References:
         Ericson, Real-Time Collision Detection (2005), section 5.1.5.
     """
+    xp: Any = np if isinstance(p, np.ndarray) else jnp
     ab, ac, bc = b - a, c - a, c - b
     ap, bp = p - a, p - b
-    zero, one = jnp.zeros_like(ap[0]), jnp.ones_like(ap[0])
+    zero, one = xp.zeros_like(ap[0]), xp.ones_like(ap[0])
 
-    def ratio(num: Array, den: Array) -> Array:
+    def ratio(num: Any, den: Any) -> Any:
         ok = den > _MIN_SQUARE
-        return jnp.where(ok, num / jnp.where(ok, den, one), zero)
+        return xp.where(ok, num / xp.where(ok, den, one), zero)
 
     # Nearest of the three edges, computed separately: correct for any degeneracy.
-    t = jnp.clip(ratio(_dot(ab, ap), _dot(ab, ab)), 0.0, 1.0)
+    t = xp.clip(ratio(_dot(ab, ap), _dot(ab, ab)), 0.0, 1.0)
     gap = ap - t[None] * ab
     v, w, best = t, zero, _dot(gap, gap)
     for base, edge, is_bc in ((ap, ac, False), (bp, bc, True)):
-        t = jnp.clip(ratio(_dot(edge, base), _dot(edge, edge)), 0.0, 1.0)
+        t = xp.clip(ratio(_dot(edge, base), _dot(edge, edge)), 0.0, 1.0)
         gap = base - t[None] * edge
         squared = _dot(gap, gap)
         near = squared < best
-        v = jnp.where(near, 1 - t if is_bc else zero, v)
-        w = jnp.where(near, t, w)
-        best = jnp.where(near, squared, best)
+        v = xp.where(near, 1 - t if is_bc else zero, v)
+        w = xp.where(near, t, w)
+        best = xp.where(near, squared, best)
     # Interior of the triangle, if the projection of p lies in it.
     d00, d01, d11 = _dot(ab, ab), _dot(ab, ac), _dot(ac, ac)
     d20, d21 = _dot(ap, ab), _dot(ap, ac)
@@ -86,11 +91,11 @@ def closest_barycentric(
     gap = ap - v_in[None] * ab - w_in[None] * ac
     squared = _dot(gap, gap)
     inside = (det > _MIN_SQUARE) & (v_in > 0) & (w_in > 0) & (v_in + w_in < 1) & (squared <= best)
-    v, w = jnp.where(inside, v_in, v), jnp.where(inside, w_in, w)
-    return jnp.stack([1 - v - w, v, w]), jnp.where(inside, squared, best)
+    v, w = xp.where(inside, v_in, v), xp.where(inside, w_in, w)
+    return xp.stack([1 - v - w, v, w]), xp.where(inside, squared, best)
 
 
-def _dot(x: Array, y: Array) -> Array:
+def _dot(x: Any, y: Any) -> Any:
     return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]
 
 
@@ -141,6 +146,7 @@ def closest_points(mesh: TriMesh, points: Float[Array, "points 3"]) -> ClosestPo
     return ClosestPoints(f, w.T, d)
 
 
+@functools.partial(jax.jit, static_argnames="exactly")
 def closest_among(
     mesh: TriMesh,
     points: Float[Array, "points 3"],

@@ -3,6 +3,7 @@
 from ._animated_mesh import (
     AnimatedMesh as AnimatedMesh,
     Look as Look,
+    Skinning as Skinning,
     StaticMesh as StaticMesh,
     smooth_normals as smooth_normals,
 )

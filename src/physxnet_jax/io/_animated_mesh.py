@@ -4,6 +4,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+import scipy.sparse as sp
 from jaxtyping import Float, Int
 
 from ..geometry import Material, Polygons, Texture
@@ -21,6 +22,7 @@ class AnimatedMesh:
         uv_faces: Corners in ``uv``, shape [faces, 3]; or None.
         colour: Display colour, linear RGB in [0, 1].
         polygons: Polygons that the triangles were cut from, with materials; or None.
+        skinning: The skeleton that moves it, if nothing else does; or None.
     """
 
     name: str
@@ -30,6 +32,7 @@ class AnimatedMesh:
     uv_faces: Int[np.ndarray, "faces 3"] | None = None
     colour: tuple[float, float, float] = (0.6, 0.6, 0.6)
     polygons: Polygons | None = None
+    skinning: "Skinning | None" = None
 
     @property
     def looks(self) -> list["Look"]:
@@ -47,6 +50,29 @@ class AnimatedMesh:
         if image is None or image.data is None or self.uv is None or self.uv_faces is None:
             return Look(m.name, self.colour if m.colour is None else m.colour, faces)
         return Look(m.name, (1.0, 1.0, 1.0) if m.colour is None else m.colour, faces, image)
+
+
+@dataclasses.dataclass(frozen=True)
+class Skinning:
+    """Linear blend skinning: ``positions[f] = sum_j weights[:, j] (R[f, j] rest + t[f, j])``.
+
+    Attributes:
+        rest: Vertices at rest [m], shape [vertices, 3].
+        heads: Positions of the joints at rest [m], shape [joints, 3].
+        names: Names of the joints.
+        parents: Parent of every joint, -1 for the root; parents come first.
+        weights: Skinning weights, shape [vertices, joints].
+        rotations: World rotations R, shape [frames, joints, 3, 3].
+        translations: World translations t [m], shape [frames, joints, 3].
+    """
+
+    rest: Float[np.ndarray, "vertices 3"]
+    heads: Float[np.ndarray, "joints 3"]
+    names: tuple[str, ...]
+    parents: tuple[int, ...]
+    weights: Float[np.ndarray, "vertices joints"]
+    rotations: Float[np.ndarray, "frames joints 3 3"]
+    translations: Float[np.ndarray, "frames joints 3"]
 
 
 class Look(NamedTuple):
@@ -112,9 +138,18 @@ def smooth_normals(
 ) -> Float[np.ndarray, "frames vertices 3"]:
     """Area-weighted unit vertex normals of every frame."""
     out = np.zeros(positions.shape, dtype=np.float32)
+    count = positions.shape[1]
+    # Sums the triangles around each vertex.
+    corners = np.arange(3 * len(faces)) // 3
+    around = sp.csr_matrix(
+        (np.ones(3 * len(faces), np.float32), (faces.reshape(-1), corners)), (count, len(faces))
+    )
     for k, x in enumerate(positions):
-        n = np.cross(x[faces[:, 1]] - x[faces[:, 0]], x[faces[:, 2]] - x[faces[:, 0]])
-        for c in range(3):
-            np.add.at(out[k], faces[:, c], n)
-        out[k] /= np.maximum(np.linalg.norm(out[k], axis=1, keepdims=True), 1e-12)
+        a, b, c = (x[faces[:, i]] for i in range(3))
+        u, v = b - a, c - a
+        n = np.stack(
+            [u[:, i] * v[:, j] - u[:, j] * v[:, i] for i, j in ((1, 2), (2, 0), (0, 1))], 1
+        )
+        out[k] = around @ n.astype(np.float32)
+        out[k] /= np.maximum(np.sqrt((out[k] ** 2).sum(axis=1, keepdims=True)), 1e-12)
     return out

@@ -7,21 +7,27 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..errors import MissingDependencyError
 from ..files import atomic_write
 from ..geometry import Texture
-from ._animated_mesh import AnimatedMesh, Look, smooth_normals, vertex_velocities
+from ._animated_mesh import AnimatedMesh, Look, Skinning, smooth_normals, vertex_velocities
 from ._texture import write_textures
 
 
 def write_usd(
-    path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float
+    path: str | pathlib.Path,
+    meshes: Sequence[AnimatedMesh],
+    fps: float,
+    *,
+    velocities: bool = False,
 ) -> list[pathlib.Path]:
     """Writes meshes as one animated stage.
 
-    Each mesh is a prim under ``/Person`` with points, normals, velocities and extent
-    as time samples (frame 0 first), ``st`` texture coordinates and no subdivision. It has the
+    Each mesh is a prim under ``/Person`` with points, normals and extent as time samples
+    (frame 0 first), ``st`` texture coordinates and no subdivision. A mesh that is only skinned
+    (the built-in body) is written once, bound to an animated skeleton (UsdSkel). Meshes have the
     polygons and materials of the mesh; several materials are bound to subsets of faces, and
     images are written beside the stage. A mesh without materials has a preview material of its
     colour. The stage's up axis is Y, its unit is the metre and its rate is ``fps``.
@@ -30,6 +36,7 @@ def write_usd(
         path: ``.usdc``, ``.usd`` or ``.usda``; written atomically.
         meshes: Meshes to write, all with the same number of frames.
         fps: Frames per second.
+        velocities: Write velocities of what isn't skinned too, for motion blur.
 
     Returns:
         The files written.
@@ -41,7 +48,7 @@ def write_usd(
     path = pathlib.Path(path)
     images = write_textures(path, [look.texture for m in meshes for look in m.looks])
     with atomic_write(path) as part:
-        _write(part, meshes, fps, {t: image.name for t, image in images.items()})
+        _write(part, meshes, fps, {t: image.name for t, image in images.items()}, velocities)
     return [path, *images.values()]
 
 
@@ -56,9 +63,13 @@ def check_usd() -> None:
 
 
 def _write(
-    part: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float, images: dict[Texture, str]
+    part: pathlib.Path,
+    meshes: Sequence[AnimatedMesh],
+    fps: float,
+    images: dict[Texture, str],
+    velocities: bool,
 ) -> None:
-    from pxr import Sdf, Usd, UsdGeom, UsdShade, Vt
+    from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 
     stage = Usd.Stage.CreateNew(str(part))
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -67,7 +78,8 @@ def _write(
     stage.SetFramesPerSecond(fps)
     stage.SetStartTimeCode(0)
     stage.SetEndTimeCode(len(meshes[0].positions) - 1)
-    root = UsdGeom.Xform.Define(stage, "/Person")
+    skinned = any(m.skinning is not None for m in meshes)
+    root = (UsdSkel.Root if skinned else UsdGeom.Xform).Define(stage, "/Person")
     stage.SetDefaultPrim(root.GetPrim())
 
     def vectors(x: np.ndarray) -> "Vt.Vec3fArray":
@@ -88,14 +100,22 @@ def _write(
         prim.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
         prim.CreateDoubleSidedAttr(True)
         points, extent = prim.CreatePointsAttr(), prim.CreateExtentAttr()
-        normals, velocities = prim.CreateNormalsAttr(), prim.CreateVelocitiesAttr()
+        normals = prim.CreateNormalsAttr()
         prim.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
-        smooth = smooth_normals(m.positions, m.faces)
-        speed = vertex_velocities(m.positions, fps)
+        if m.skinning is not None:
+            points.Set(vectors(m.skinning.rest))
+            normals.Set(vectors(smooth_normals(m.skinning.rest[None], m.faces)[0]))
+            _bind_skeleton(stage, prim, m.skinning, name)
+        else:
+            smooth = smooth_normals(m.positions, m.faces)
+            for k, x in enumerate(m.positions):
+                points.Set(vectors(x), k)
+                normals.Set(vectors(smooth[k]), k)
+            if velocities:
+                speed = prim.CreateVelocitiesAttr()
+                for k, v in enumerate(vertex_velocities(m.positions, fps)):
+                    speed.Set(vectors(v), k)
         for k, x in enumerate(m.positions):
-            points.Set(vectors(x), k)
-            normals.Set(vectors(smooth[k]), k)
-            velocities.Set(vectors(speed[k]), k)
             extent.Set(vectors(np.stack([x.min(axis=0), x.max(axis=0)])), k)
         if m.uv is not None and m.uv_faces is not None:
             st = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(
@@ -117,6 +137,66 @@ def _write(
             )
             UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(looks.material(look))
     stage.GetRootLayer().Save()
+
+
+def _bind_skeleton(stage: Any, prim: Any, skin: Skinning, name: str) -> None:
+    """Defines an animated skeleton, and binds a mesh to it.
+
+    References:
+        OpenUSD, UsdSkel schemas: a joint's matrix times the inverse of its bind matrix moves
+        the points at rest.
+    """
+    from pxr import Gf, UsdGeom, UsdSkel, Vt
+
+    paths: list[str] = []
+    for joint, parent in zip(skin.names, skin.parents, strict=True):
+        own = re.sub(r"[^A-Za-z0-9_]", "_", joint)
+        paths.append(own if parent < 0 else f"{paths[parent]}/{own}")
+    skeleton = UsdSkel.Skeleton.Define(stage, f"/Person/{name}_skeleton")
+    animation = UsdSkel.Animation.Define(stage, f"/Person/{name}_skeleton/motion")
+    heads = skin.heads.astype(np.float64)
+    parents = np.asarray(skin.parents)
+    offsets = heads - np.where(parents[:, None] >= 0, heads[parents], 0.0)
+    eye = Gf.Matrix3d(1.0)
+    for attribute, places in (
+        (skeleton.CreateBindTransformsAttr(), heads),
+        (skeleton.CreateRestTransformsAttr(), offsets),
+    ):
+        attribute.Set(
+            Vt.Matrix4dArray([Gf.Matrix4d(eye, Gf.Vec3d(*map(float, p))) for p in places])
+        )
+    skeleton.CreateJointsAttr(paths)
+    animation.CreateJointsAttr(paths)
+    UsdSkel.BindingAPI.Apply(skeleton.GetPrim()).CreateAnimationSourceRel().SetTargets(
+        [animation.GetPath()]
+    )
+    turns = skin.rotations.astype(np.float64)
+    places = np.einsum("fjab,jb->fja", turns, heads) + skin.translations
+    above = np.where((parents >= 0)[None, :, None, None], turns[:, parents], np.eye(3))
+    origin = np.where((parents >= 0)[None, :, None], places[:, parents], 0.0)
+    local = np.swapaxes(above, 2, 3) @ turns
+    step = np.einsum("fjba,fjb->fja", above, places - origin)
+    quaternions = (
+        Rotation.from_matrix(local.reshape(-1, 3, 3)).as_quat().reshape(*local.shape[:2], 4)
+    )
+    rotations, translations = animation.CreateRotationsAttr(), animation.CreateTranslationsAttr()
+    animation.CreateScalesAttr(Vt.Vec3hArray([Gf.Vec3h(1, 1, 1)] * len(paths)))
+    for k in range(len(local)):
+        rotations.Set(Vt.QuatfArray.FromNumpy(quaternions[k].astype(np.float32)), k)
+        translations.Set(Vt.Vec3fArray.FromNumpy(step[k].astype(np.float32)), k)
+    count = int((skin.weights > 0).sum(axis=1).max())
+    most = np.argsort(-skin.weights, axis=1, kind="stable")[:, :count]
+    share = np.take_along_axis(skin.weights, most, axis=1)
+    binding = UsdSkel.BindingAPI.Apply(prim.GetPrim())
+    binding.CreateSkeletonRel().SetTargets([skeleton.GetPath()])
+    binding.CreateJointIndicesPrimvar(False, count).Set(
+        Vt.IntArray.FromNumpy(np.ascontiguousarray(most.ravel(), np.int32))
+    )
+    binding.CreateJointWeightsPrimvar(False, count).Set(
+        Vt.FloatArray.FromNumpy(np.ascontiguousarray(share.ravel(), np.float32))
+    )
+    binding.CreateGeomBindTransformAttr(Gf.Matrix4d(1.0))
+    UsdGeom.Imageable(skeleton).CreatePurposeAttr(UsdGeom.Tokens.guide)
 
 
 class _Looks:

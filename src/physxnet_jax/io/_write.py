@@ -51,11 +51,16 @@ def check_output(path: str | pathlib.Path, frames: int | None = None) -> pathlib
 
 
 def write_clip(
-    path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float
+    path: str | pathlib.Path,
+    meshes: Sequence[AnimatedMesh],
+    fps: float,
+    *,
+    velocities: bool = False,
 ) -> list[pathlib.Path]:
     """Writes a clip.
 
-    ``.usdc``, ``.usd``, ``.usda``: one stage, with images of materials beside it as
+    ``.usdc``, ``.usd``, ``.usda``: one stage, the built-in body as a skeleton with a skin,
+    with images of materials beside it as
     ``STEM_IMAGE.png``. ``.glb``: glTF with a morph target per frame. ``.html``: a page that
     plays the clip. ``.npz``: ``NAME_positions``, ``NAME_faces`` and ``fps``. ``.pc2``,
     ``.mdd``: for each mesh a cache and an OBJ of its first frame with the same vertex order,
@@ -67,6 +72,7 @@ def write_clip(
         path: Output path; its extension selects the format.
         meshes: Meshes to write [m], Y up, all with the same number of frames.
         fps: Frames per second.
+        velocities: USD: write velocities too, for motion blur.
 
     Returns:
         The files written.
@@ -78,7 +84,7 @@ def write_clip(
     path = check_output(path)
     suffix = path.suffix.lower()
     if suffix.startswith(".usd"):
-        return write_usd(path, meshes, fps)
+        return write_usd(path, meshes, fps, velocities=velocities)
     if suffix == ".npz":
         arrays = {"fps": np.asarray(fps)}
         for m in meshes:

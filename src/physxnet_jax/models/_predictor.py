@@ -1,7 +1,9 @@
 """The predictor: a network with its normalisation and atlas."""
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -162,11 +164,10 @@ class Predictor:
 
         With test-time augmentation a batch of two: of the garment and of its mirror image.
         """
-        network = nnx.merge(self.graph, self.state)
         maps = conditions[None].astype(self._dtype)
         if self.mirror_tta:
             maps = jnp.concatenate([maps, maps[:, :, ::-1]])
-        return network.modulation(template, maps)
+        return _modulation(self.graph, template, self.state, maps)
 
     def __call__(
         self,
@@ -242,6 +243,13 @@ class Predictor:
         covered = self.texel_points.valid[template].astype(plain.dtype)[:, None]
         share = 0.5 * self.atlas.from_map(self.atlas.to_map(covered)[:, ::-1])[None]
         return plain + share * (twin - plain)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _modulation(
+    graph: Any, template: str, state: Any, maps: Float[Array, "batch height width channels"]
+) -> Modulation:
+    return nnx.merge(graph, state).modulation(template, maps)
 
 
 def _mirror_maps(

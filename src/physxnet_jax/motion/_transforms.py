@@ -1,5 +1,7 @@
 """Joint transforms of a clip, in blocks of fixed size to avoid recompilation."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +36,7 @@ def _transforms(body: Body, rest: Array, q: Array, p: Array) -> tuple[Array, Arr
     return jax.vmap(lambda a, b: body.transforms(rest, a, b))(jnp.asarray(q), jnp.asarray(p))
 
 
+@functools.partial(jax.jit, static_argnames="count")
 def extrapolate_history(
     rotations: Float[Array, "frames joints 4"],
     root: Float[Array, "frames 3"],
@@ -63,13 +66,13 @@ def extrapolate_history(
     known = jnp.isfinite(q).all() & jnp.isfinite(p).all()
     q, p = jnp.where(known, q, rotations[0]), jnp.where(known, p, root[0])
     step = safe_normalize(quaternion_multiply(rotations[0], quaternion_conjugate(q)))
-    turns, places = [], []
-    last, at = rotations[0], root[0]
-    for _ in range(count):
-        last, at = quaternion_multiply(step, last), at + (root[0] - p)
-        turns.append(last)
-        places.append(at)
-    return jnp.stack(turns[::-1]), jnp.stack(places[::-1])
+
+    def further(now: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple]:
+        last, at = quaternion_multiply(step, now[0]), now[1] + (root[0] - p)
+        return (last, at), (last, at)
+
+    turns, places = jax.lax.scan(further, (rotations[0], root[0]), None, count, reverse=True)[1]
+    return turns, places
 
 
 def history_transforms(

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -32,8 +31,6 @@ _MAX_DISTANCE_RATIO = 2.0
 
 # Above this number of vertices, rays are cast block by block.
 _MANY = 8192
-
-_closest_among = jax.jit(closest_among)
 
 
 @pytree
@@ -252,7 +249,7 @@ def _closest(
     # Of faces that share the closest point, the first counts.
     near = np.sort(near, axis=1)
     padded = jnp.asarray(padded_rows(points)), jnp.asarray(padded_rows(near))
-    found = _closest_among(mesh, *padded)
+    found = closest_among(mesh, *padded)
     parts = (found.face, found.weights, found.squared_distance)
     face, weights, squared = (np.asarray(x)[: len(points)] for x in parts)
     return face, weights, squared

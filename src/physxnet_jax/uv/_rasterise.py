@@ -86,13 +86,12 @@ def _owners(
     no_face: int,
 ) -> Array:
     """First covering face of every texel; the number of faces where there is none."""
-    offsets = jnp.stack(
-        jnp.meshgrid(jnp.arange(size), jnp.arange(size), indexing="xy"), axis=-1
-    ).reshape(-1, 2)
+    square = np.meshgrid(np.arange(size), np.arange(size), indexing="xy")
+    offsets = np.stack(square, axis=-1).reshape(-1, 2).astype(np.int32)
 
     def block(owner: Array, part: tuple[Array, Array, Array]) -> tuple[Array, None]:
         tri, corner, ids = part
-        at = corner[:, None] + offsets[None].astype(corner.dtype)
+        at = corner[:, None] + offsets[None]
         p = at.astype(xy.dtype)
         functions = []
         for k in range(3):

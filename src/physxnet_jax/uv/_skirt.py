@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from ..body import NUM_BODY_VERTICES, Body
 from ..garment import Garment
-from ..geometry import TriMesh, closest_among
+from ..geometry import closest_barycentric
 from ..typing import pytree
 from ._rasterise import rasterise
 from ._transference import Transference
@@ -176,14 +176,22 @@ def make_skirt_chart(body: Body, rows: int, columns: int) -> SkirtChart:
 
 
 def _nearest(rest: np.ndarray, faces: np.ndarray, points: np.ndarray) -> Transference:
-    vertices = jnp.asarray(rest[:NUM_BODY_VERTICES].astype(np.float32))
-    mesh = TriMesh(vertices, jnp.asarray(faces.astype(np.int32)), None, None)
+    vertices = rest[:NUM_BODY_VERTICES].astype(np.float32)
     # Among the faces whose centres are nearest: faces of a body are small.
     centres = rest[faces].mean(axis=1)
     candidates = KDTree(centres).query(points, _CANDIDATES)[1].astype(np.int32)
-    near = closest_among(mesh, jnp.asarray(points.astype(np.float32)), jnp.asarray(candidates))
-    corners = jnp.asarray(faces[np.asarray(near.face)].astype(np.int32))
-    return Transference(corners, near.weights, jnp.ones(len(points), bool), NUM_BODY_VERTICES)
+    corners = np.moveaxis(vertices[faces[candidates]], (2, 3), (0, 1))
+    p = np.ascontiguousarray(points.astype(np.float32).T)
+    _, squared = closest_barycentric(np.broadcast_to(p[:, :, None], corners[0].shape), *corners)
+    rows = np.arange(len(points))
+    nearest = np.asarray(candidates)[rows, np.argmin(squared, axis=1)]
+    weights, _ = closest_barycentric(p, *np.moveaxis(vertices[faces[nearest]], 0, 2))
+    return Transference(
+        jnp.asarray(faces[nearest].astype(np.int32)),
+        jnp.asarray(weights.T),
+        jnp.asarray(np.ones(len(points), bool)),
+        NUM_BODY_VERTICES,
+    )
 
 
 def skirt_rows(

@@ -278,7 +278,9 @@ class Studio:
             covered[v[there].astype(int), u[there].astype(int)] = 1.0
             covered = gaussian_filter(covered, blur / size)
             if pixels < _PIXELS:
-                covered = zoom(covered, _PIXELS // pixels, order=1, grid_mode=True, mode="nearest")
+                covered = np.asarray(
+                    zoom(covered, _PIXELS // pixels, order=1, grid_mode=True, mode="nearest")
+                )
             shade = 1.0 - (1.0 - shade) * (1.0 - strength * np.clip(1.6 * covered, 0.0, 1.0))
         at = (np.arange(_PIXELS) + 0.5) * pixel - _REACH
         lines = np.zeros((_PIXELS, _PIXELS))

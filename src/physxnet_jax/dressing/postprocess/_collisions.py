@@ -171,20 +171,29 @@ def make_collider(
         middle = np.searchsorted(rows, np.asarray(skirt.middles)).astype(np.int32)
         around = local[table.size :].reshape(skirt.table.shape).astype(np.int32)
         skirt = dataclasses.replace(skirt, middles=jnp.asarray(middle), table=jnp.asarray(around))
+    own, normals, weights = _picked_skin(mesh.vertices, mesh.faces, body.weights, pick)
     return BodyCollider(
         pick,
-        mesh.vertices[pick],
-        vertex_normals(mesh.vertices, mesh.faces)[pick],
-        body.weights[pick],
+        own,
+        normals,
+        weights,
         jnp.asarray(corners.reshape(-1, 3).astype(np.int32)),
         jnp.asarray(np.searchsorted(rows, places).astype(np.int32)),
         jnp.asarray(choices.astype(np.int32)),
         jnp.asarray(local[: table.size].reshape(table.shape).astype(np.int32)),
         jnp.asarray(minimum_clearance(points, np.asarray(garment.faces))),
-        jnp.full((len(points),), jnp.inf, jnp.float32),
+        jnp.asarray(np.full(len(points), np.inf, np.float32)),
         skirt,
         carry,
     )
+
+
+@jax.jit
+def _picked_skin(
+    vertices: Array, faces: Array, weights: Array, pick: Array
+) -> tuple[Array, Array, Array]:
+    """Positions, normals and skinning weights of some skin vertices."""
+    return vertices[pick], vertex_normals(vertices, faces)[pick], weights[pick]
 
 
 def _sample_places(

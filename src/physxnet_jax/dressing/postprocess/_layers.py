@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import TypeVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -132,7 +131,7 @@ def _make_layer(
     near = KDTree(other[faces].mean(axis=1)).query(points, k=k)[1].reshape(len(points), k)
     # A large triangle may be near although its centroid is far away.
     mesh = TriMesh(jnp.asarray(other), jnp.asarray(faces))
-    hit = jax.jit(closest_among)(mesh, jnp.asarray(points), jnp.asarray(near.astype(np.int32)))
+    hit = closest_among(mesh, jnp.asarray(points), jnp.asarray(near.astype(np.int32)))
     rows = np.flatnonzero(np.asarray(hit.squared_distance) < _MAX_DISTANCE**2)
     least = (
         np.full(len(points), _PRESS_CLEARANCE, np.float32)

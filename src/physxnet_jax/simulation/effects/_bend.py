@@ -1,10 +1,12 @@
 """Bending: quadratic isometric energy over hinges, flat at rest."""
 
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -221,32 +223,8 @@ class _Bend(Prepared):
         return dataclasses.replace(self, hinges=hinges, weight=rest.inverse_mass, values=None)
 
     def at_step(self, h: float) -> Prepared:
-        """Assembles W K, with hinges softened where it would be unstable."""
-        hinges, rows = self.hinges, self.rows
-        corners = hinges.index
-        c = [x[:, 0, 0] for x in hinges.coefficient]
-        k = 1.0 / hinges.compliance[:, 0, 0]
-        size = [jnp.abs(x) for x in c]
-        total = sum(size)
-        load = jnp.zeros_like(self.weight)
-        for i, s in zip(corners, size, strict=True):
-            load = load.at[i].add(self.weight[i] * k * s * total)
-        bound = _chebyshev(_degree(self.typical * h * h))[1] / (h * h)
-        soft = jnp.minimum(1.0, bound / jnp.maximum(load, 1e-12))
-        k = k * jnp.minimum(
-            jnp.minimum(soft[corners[0]], soft[corners[1]]),
-            jnp.minimum(soft[corners[2]], soft[corners[3]]),
-        )
-        added = jnp.stack([k * c[i] * c[j] for i, j in _PAIRS])
-        values = jnp.zeros(rows.near.size + rows.more.size, k.dtype).at[self.slots].add(added)
-        everyone = jnp.arange(len(self.weight), dtype=rows.many.dtype)
-        owner = jnp.concatenate(
-            [
-                jnp.broadcast_to(v, t.shape).ravel()
-                for v, t in ((everyone, rows.near), (rows.many, rows.more))
-            ]
-        )
-        return dataclasses.replace(self, values=values * self.weight[owner])
+        """Assembles W K."""
+        return dataclasses.replace(self, values=_assembled(self, h))
 
     def begin(self, base: Array, start: None, end: None, clock: Clock, state: Any) -> tuple:
         return base, () if self.values is None else self.rows.product(self.values, base)
@@ -284,3 +262,33 @@ class _Bend(Prepared):
         c = [x[:, 0, 0] for x in h.coefficient]
         k = 1.0 / h.compliance[:, 0, 0]
         return jnp.concatenate([k * a * b for a in c for b in c])
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _assembled(bend: _Bend, h: float) -> Float[Array, " slots"]:
+    """The values of W K, with hinges softened where it would be unstable."""
+    hinges, rows = bend.hinges, bend.rows
+    corners = hinges.index
+    c = [x[:, 0, 0] for x in hinges.coefficient]
+    k = 1.0 / hinges.compliance[:, 0, 0]
+    size = [jnp.abs(x) for x in c]
+    total = sum(size)
+    load = jnp.zeros_like(bend.weight)
+    for i, s in zip(corners, size, strict=True):
+        load = load.at[i].add(bend.weight[i] * k * s * total)
+    bound = _chebyshev(_degree(bend.typical * h * h))[1] / (h * h)
+    soft = jnp.minimum(1.0, bound / jnp.maximum(load, 1e-12))
+    k = k * jnp.minimum(
+        jnp.minimum(soft[corners[0]], soft[corners[1]]),
+        jnp.minimum(soft[corners[2]], soft[corners[3]]),
+    )
+    added = jnp.stack([k * c[i] * c[j] for i, j in _PAIRS])
+    values = jnp.zeros(rows.near.size + rows.more.size, k.dtype).at[bend.slots].add(added)
+    everyone = jnp.arange(len(bend.weight), dtype=rows.many.dtype)
+    owner = jnp.concatenate(
+        [
+            jnp.broadcast_to(v, t.shape).ravel()
+            for v, t in ((everyone, rows.near), (rows.many, rows.more))
+        ]
+    )
+    return values * bend.weight[owner]
