@@ -1,9 +1,9 @@
-"""Draws docs/pipeline.png, docs/demo.png and docs/walk.gif: maps in, maps out, mesh dressed.
+"""Draws docs/pipeline.png: maps in, maps out, mesh dressed.
 
 Command: python experiments/draw_pipeline.py
 Cost:    two minutes.
 Result:  one frame of the built-in punch: velocity, acceleration, gravity and offset maps
-         beside the dressed body; six moments of the built-in walk, and the walk moving.
+         beside the dressed body.
 """
 
 import imageio.v3 as iio
@@ -15,7 +15,7 @@ from physxnet_jax.dressing import dress
 from physxnet_jax.garment import DEFAULT_KINDS, tailor
 from physxnet_jax.models import clip_features
 from physxnet_jax.motion import clip_transforms, load_motion
-from physxnet_jax.viewer import magnified, render_frame, render_preview, texel_picture
+from physxnet_jax.viewer import magnified, render_frame, texel_picture
 
 FRAME = 31
 SIZE = 288
@@ -51,9 +51,6 @@ def main() -> None:
     mesh = render_frame(clip.meshes, FRAME, size=(512, maps.shape[0] // 16 * 16))
     high = min(len(maps), len(mesh))
     iio.imwrite("docs/pipeline.png", np.concatenate([maps[:high], mesh[:high]], axis=1))
-    walk = dress("walk", ["shirt", "trousers"], frames=60)
-    render_preview("docs/demo.png", walk.meshes, walk.fps, size=(240, 416), strip=6)
-    render_preview("docs/walk.gif", walk.meshes, walk.fps, size=(240, 320))
 
 
 if __name__ == "__main__":

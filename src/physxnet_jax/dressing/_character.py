@@ -275,10 +275,11 @@ def write_dressed_character(
         FormatError: The character isn't driven by a motion, the file has another extension,
             or there are too many frames for morph targets.
 
-    Example:
-        >>> person = load_character("hero.vrm", motion="walk", frames=60)
-        >>> clip = dress(person, ["shirt", "trousers"])
-        >>> write_dressed_character("hero_dressed.glb", person, clip.garments)
+    ::
+
+        person = px.load_character("hero.vrm", motion="walk", frames=60)
+        clip = px.dress(person, ["shirt", "trousers"])
+        px.write_dressed_character("hero_dressed.glb", person, clip.garments)
     """
     path = pathlib.Path(path)
     if character.rig is None:

@@ -100,12 +100,6 @@ def inspect_character(path: str | pathlib.Path) -> CharacterInspection:
 
     Raises:
         PhysXNetError: It can't be read, has no skin, or its joints are unknown.
-
-    Example:
-        >>> inspect_character("nobody.vrm")
-        Traceback (most recent call last):
-        ...
-        physxnet_jax.errors.MotionError: nobody.vrm: no such file. Check the path.
     """
     file = split_animation(path)[0]
     document = GltfFile(file)

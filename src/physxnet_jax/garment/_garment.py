@@ -140,17 +140,8 @@ class Garment:
         References:
             MakeHuman's mhclo files attach clothes in the same way.
         """
-        return _carried_points(rest, self.refs, self.ref_weights, self.offset)
-
-
-@jax.jit
-def _carried_points(
-    rest: Float[Array, "all 3"],
-    refs: Int[Array, "vertices k"],
-    ref_weights: Float[Array, "vertices k"],
-    offset: Float[Array, "vertices 3"],
-) -> Float[Array, "vertices 3"]:
-    return jnp.sum(rest[refs] * ref_weights[:, :, None], axis=1) + offset
+        carried = rest[self.refs] * self.ref_weights[:, :, None]
+        return jnp.sum(carried, axis=1) + self.offset
 
 
 @jax.jit

@@ -49,7 +49,8 @@ class Motion:
             MotionError: No frame is left, or the step isn't positive.
 
         Example:
-            >>> procedural_clip("walk", fps=30.0)[10:40].num_frames
+            >>> still = make_motion(np.tile([1.0, 0, 0, 0], (60, 31, 1)), np.zeros((60, 3)), 30.0)
+            >>> still[10:40].num_frames
             30
         """
         if not isinstance(frames, slice):
