@@ -10,7 +10,11 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-PAGES = [p for p in sorted(ROOT.glob("docs/*.md")) if "```python" in p.read_text()]
+PAGES = [
+    p
+    for p in sorted((ROOT / "docs").rglob("*.md"))
+    if "```python" in p.read_text() and "_build" not in p.parts
+]
 
 pytestmark = pytest.mark.release
 
