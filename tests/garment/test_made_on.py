@@ -50,7 +50,8 @@ def test_garments_come_back_from_the_body_that_they_were_made_on(other, kind):
 @pytest.mark.release
 def test_garments_far_from_their_body_are_refused(other, tmp_path):
     g = template("top")
-    write_obj(tmp_path / "far.obj", np.asarray(g.mesh.vertices) + 5.0, np.asarray(g.mesh.faces))
+    far = 100 * (np.asarray(g.mesh.vertices)[:, [0, 2, 1]] * [1, -1, 1] + 5.0)
+    write_obj(tmp_path / "far.obj", far, np.asarray(g.mesh.faces))
     with pytest.raises(MeshError, match="from one scene"):
         load_garment(f"{tmp_path / 'far.obj'}:made_on={other / 'avatar.obj'}")
 
