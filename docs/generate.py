@@ -298,7 +298,7 @@ def errors_page() -> str:
         "# Errors",
         "",
         "All exceptions derive from `PhysXNetError`; a message names the file or the value, what",
-        "is wrong and what mends it. The command prints no traceback without `--debug`.",
+        "is wrong and how to fix it. The command prints no traceback without `--debug`.",
         "",
         "| exception | meaning |",
         "|---|---|",

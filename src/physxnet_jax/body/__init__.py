@@ -32,3 +32,4 @@ from ._segments import (
     UPPER_ARMS as UPPER_ARMS,
     body_segments as body_segments,
 )
+from ._units import UNITS as UNITS, unit_of_person as unit_of_person

@@ -274,7 +274,6 @@ def _run(
     if output.out is not None:
         person = job.motion
         if isinstance(person, Character) and _keeps_rig(person, output):
-            person = person.after(job.start)
             written.append(write_dressed_character(output.out, person, clip.garments))
         else:
             written += write_clip(output.out, clip.meshes, clip.fps, velocities=output.velocities)

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from ..body import UNITS, unit_of_person
 from ..errors import FormatError
 from ..files import is_file, read_arrays
 from ..io import (
@@ -37,9 +38,6 @@ _MAX_COORDINATES = 3e8
 _MAX_COORDINATE = 1e18
 # Smallest frame rate that a file may declare: one frame per hour [1/s].
 _MIN_RATE = 1 / 3600
-# Smallest and largest height of a person, child or adult [m], and units that programs write.
-_HEIGHTS = (0.8, 2.6)
-_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254}
 
 
 class RigClip(NamedTuple):
@@ -310,15 +308,15 @@ def _in_metres(path: pathlib.Path, moving: SourceMesh, up: str | None) -> Read:
         if up == "Z":
             notes.append("Z is up: the person is higher along it than along Y")
     height = float(extent[2 if up == "Z" else 1])
-    fitting = [n for n, s in _UNITS.items() if _HEIGHTS[0] <= s * height <= _HEIGHTS[1]]
-    if not fitting:
+    unit = unit_of_person(height)
+    if unit is None:
         raise FormatError(
             f"{path}: its height is {height:.3g} in its first frame, which is no person's height in"
-            f" {', '.join(_UNITS)}. Scale it, or choose its body with --body-mesh."
+            f" {', '.join(UNITS)}. Scale it, or choose its body with --body-mesh."
         )
-    if fitting[0] != "m":
-        notes.append(f"the unit is {fitting[0]}: the person is {height:.3g} high")
-    scale = _UNITS[fitting[0]]
+    if unit != "m":
+        notes.append(f"the unit is {unit}: the person is {height:.3g} high")
+    scale = UNITS[unit]
 
     def turned(p: np.ndarray) -> np.ndarray:
         p = p[..., [0, 2, 1]] * np.array([1.0, 1.0, -1.0], p.dtype) if up == "Z" else p

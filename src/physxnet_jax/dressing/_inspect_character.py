@@ -4,17 +4,13 @@ import dataclasses
 import pathlib
 import shlex
 
-import numpy as np
-
-from ..body import load_body
+from ..body import load_body, unit_of_person
 from ..errors import PhysXNetError
-from ..io import GLTF_FORMATS, GltfFile, read_gltf_still
+from ..io import GLTF_FORMATS, GltfFile, SourceMesh, read_gltf_still
 from ..motion import find_joint_map, inspect_motion, joint_index, read_rig, split_animation
 
 # A mesh that covers this share of the height from foot to head joint is a person's, not cloth.
 _WHOLE = 0.85
-_HEIGHTS = (0.8, 2.6)
-_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,7 +69,7 @@ def is_character(path: str | pathlib.Path) -> bool:
             return False
         rig = read_rig(file)
         index = joint_index(rig.clip, load_body())
-        low, high = _span(path)
+        low, high = _span(_skinned(path))
     # Damaged files are reported by whoever reads them.
     except (PhysXNetError, TypeError, ValueError, AttributeError, LookupError):
         return False
@@ -83,13 +79,14 @@ def is_character(path: str | pathlib.Path) -> bool:
     return bool(high > head and low < feet and high - low > _WHOLE * (head - feet))
 
 
-def _span(path: pathlib.Path) -> tuple[float, float]:
-    """Lowest and highest coordinate along Y of the skinned meshes in the bind pose."""
-    parts = [p.bind for p in read_gltf_still(path) if p.bind is not None]
-    if not parts:
-        return 0.0, 0.0
-    y = np.concatenate([p[:, 1] for p in parts])
-    return float(y.min()), float(y.max())
+def _skinned(path: pathlib.Path) -> list[SourceMesh]:
+    return [p for p in read_gltf_still(path) if p.bind is not None]
+
+
+def _span(parts: list[SourceMesh]) -> tuple[float, float]:
+    """Lowest and highest coordinate along Y of skinned meshes in the bind pose."""
+    y = [p.bind[:, 1] for p in parts if p.bind is not None]
+    return (float(min(x.min() for x in y)), float(max(x.max() for x in y))) if y else (0.0, 0.0)
 
 
 def inspect_character(path: str | pathlib.Path) -> CharacterInspection:
@@ -105,11 +102,9 @@ def inspect_character(path: str | pathlib.Path) -> CharacterInspection:
     document = GltfFile(file)
     rig = read_rig(document)
     family, index = find_joint_map(rig.clip)
-    parts = [p for p in read_gltf_still(file) if p.bind is not None]
-    low, high = _span(file)
-    unit = next(
-        (n for n, s in _UNITS.items() if _HEIGHTS[0] <= s * (high - low) <= _HEIGHTS[1]), None
-    )
+    parts = _skinned(file)
+    low, high = _span(parts)
+    unit = unit_of_person(high - low)
     names = document.animation_names()
     longest = names[document.animation()] if names else None
     problems, notes = [], []

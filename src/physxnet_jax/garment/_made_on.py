@@ -7,7 +7,14 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from ..body import NUM_BODY_VERTICES, Body, Registration, load_body, register_body
+from ..body import (
+    NUM_BODY_VERTICES,
+    Body,
+    Registration,
+    load_body,
+    register_body,
+    unit_of_person,
+)
 from ..errors import MeshError
 from ..geometry import boundary_loops
 from ..io import StaticMesh, read_mesh
@@ -16,8 +23,6 @@ from ._openings import openings
 from ._poses import posed_bodies
 from ._search import UNITS
 
-# Smallest and largest height of a person [m].
-_HEIGHTS = (0.8, 2.6)
 # Skin vertices that carry a garment vertex, and the width of their weights [m].
 _CARRIERS, _WIDTH = 32, 0.03
 # Skin vertices whose rotation is fitted together.
@@ -48,8 +53,7 @@ def placed_by_body(
     extent = np.ptp(other.vertices, axis=0)
     up = other.up or ("Z" if extent[2] > extent[1] else "Y")
     height = float(extent["XYZ".index(up[-1])])
-    fitting = [n for n, s in UNITS.items() if _HEIGHTS[0] <= s * height <= _HEIGHTS[1]]
-    unit = other.unit if other.unit in fitting else next(iter(fitting), None)
+    unit = unit_of_person(height)
     if unit is None or up not in ("Y", "Z"):
         raise MeshError(
             f"{made_on}: its height is {height:.3g}, which is no person's in {', '.join(UNITS)}:"
