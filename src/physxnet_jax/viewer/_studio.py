@@ -247,7 +247,9 @@ class Studio:
             part.point_data.active_normals = normals[k][rows]
         target = self._targets[frame]
         self._ground.SetPosition(target[0], self.floor - 0.003, target[2])
-        self._ground.texture = pyvista.Texture(self._floor_picture(frame, target))
+        picture = pyvista.Texture(self._floor_picture(frame, target))
+        picture.interpolate = True
+        self._ground.texture = picture
         eye = self._eyes[frame]
         self.plotter.camera_position = [tuple(eye), tuple(target), (0.0, 1.0, 0.0)]
         self.plotter.camera.view_angle = _VIEW
