@@ -26,7 +26,7 @@ def main() -> None:
     choice = Choice("walk", ("top", "bottom"), weights="small+relax", frames=60, live=True)
     viewer = Viewer(choice)
     viewer.wait()
-    viewer._playing.value = False
+    viewer.controls.playing.value = False
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         page = _SCENE_FILE_KEYS["Page"](viewer.url, folder, (1280, 800))
         page.until("document.querySelector('canvas') !== null")
@@ -34,7 +34,7 @@ def main() -> None:
 
         def shoot(name: str, frame: int, scroll: int = 0) -> None:
             viewer.wait()
-            viewer._frame.value = frame
+            viewer.controls.frame.value = frame
             page.run(_CLOSE)
             page.run(
                 "document.querySelectorAll('div').forEach(d => {if (d.scrollHeight >"
@@ -44,15 +44,15 @@ def main() -> None:
             iio.imwrite(DOCS / f"viewer-{name}.png", page.picture().astype(np.uint8))
 
         for frame in range(50):
-            viewer._frame.value = frame
+            viewer.controls.frame.value = frame
         shoot("network", 20)
-        viewer._widgets["live"].value = False
-        viewer._worn["top"].value = viewer._worn["bottom"].value = False
-        viewer._worn["dress"].value = True
-        viewer._show_maps.value = True
+        viewer.controls.settings["live"].value = False
+        viewer.controls.worn["top"].value = viewer.controls.worn["bottom"].value = False
+        viewer.controls.worn["dress"].value = True
+        viewer.controls.show_maps.value = True
         shoot("maps", 25, 700)
-        viewer._show_maps.value = False
-        viewer._widgets["compare"].value = True
+        viewer.controls.show_maps.value = False
+        viewer.controls.settings["compare"].value = True
         shoot("error", 30)
         page.close()
     viewer.close()

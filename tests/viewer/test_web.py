@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import pathlib
+import re
 import runpy
 import threading
 import time
@@ -25,6 +26,7 @@ from physxnet_jax.motion import procedural_clip, save_motion
 pytest.importorskip("viser")
 
 from physxnet_jax.viewer import Choice, Viewer, record, run_job
+from physxnet_jax.viewer._controls import METHOD_LABELS
 
 _BROWSER = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "browser.py"))
 SHORT = Choice("walk", ("bottom",), method="lbs", frames=10, fps=10.0)
@@ -40,9 +42,9 @@ def viewer():
 
 def test_viewer_shows_the_selected_choice(viewer):
     assert viewer.shown.choice == SHORT and viewer.shown.num_frames == 10
-    viewer._widgets["motion"].value = "balance"
-    viewer._worn["top"].value = True
-    viewer._shapes["weight_up"].value = 0.5
+    viewer.controls.settings["motion"].value = "balance"
+    viewer.controls.worn["top"].value = True
+    viewer.controls.shapes["weight_up"].value = 0.5
     shown = viewer.wait()
     assert shown.choice.motion == "balance" and shown.choice.wear == ("bottom", "top")
     assert shown.choice.shape == (("weight_up", 0.5),)
@@ -51,9 +53,9 @@ def test_viewer_shows_the_selected_choice(viewer):
     assert np.ptp(shown.garments[0].positions[0][:, 0]) > np.ptp(
         slim.garments[0].positions[0][:, 0]
     )
-    viewer._shapes["weight_up"].value = 0.0
-    viewer._worn["top"].value = False
-    viewer._widgets["motion"].value = "walk"
+    viewer.controls.shapes["weight_up"].value = 0.0
+    viewer.controls.worn["top"].value = False
+    viewer.controls.settings["motion"].value = "walk"
     assert viewer.wait().choice == SHORT
 
 
@@ -62,17 +64,17 @@ def test_wait_covers_selections_not_yet_requested(viewer, monkeypatch):
     viewer.wait()
     late = threading.Timer(1.0, Viewer.ask, (viewer,))
     monkeypatch.setattr(viewer, "ask", late.start)
-    viewer._worn["top"].value = True
+    viewer.controls.worn["top"].value = True
     assert [m.name for m in viewer.wait().garments] == ["bottom", "top"]
     monkeypatch.undo()
-    viewer._worn["top"].value = False
+    viewer.controls.worn["top"].value = False
     assert viewer.wait().choice == SHORT
 
 
 def test_viewer_shows_the_body_without_garments(viewer):
-    viewer._worn["bottom"].value = False
+    viewer.controls.worn["bottom"].value = False
     assert viewer.wait().garments == ()
-    viewer._worn["bottom"].value = True
+    viewer.controls.worn["bottom"].value = True
     assert len(viewer.wait().garments) == 1
 
 
@@ -80,8 +82,10 @@ def test_errors_are_reported_and_recovered_from(viewer, tmp_path):
     viewer.add_file("../../broken.bvh", b"HELLO")
     with pytest.raises(PhysXNetError, match="HIERARCHY"):
         viewer.wait()
-    assert "HIERARCHY" in viewer._status.content and ".." not in str(viewer._files["broken.bvh"])
-    viewer._widgets["motion"].value = "walk"
+    assert "HIERARCHY" in viewer.controls.status.content and ".." not in str(
+        viewer.controls.files["broken.bvh"]
+    )
+    viewer.controls.settings["motion"].value = "walk"
     assert viewer.wait().choice == SHORT
     with pytest.raises(FormatError, match="neither a motion"):
         viewer.add_file("a.exe", b"MZ")
@@ -103,10 +107,10 @@ def test_garments_keep_the_order_in_which_they_were_named(tmp_path, monkeypatch)
     monkeypatch.setattr("physxnet_jax.viewer._web.run_job", nothing)
     it = Viewer(dataclasses.replace(SHORT, wear=named), port=8131)
     try:
-        assert it.chosen().wear == named and len(it._worn) == 5
-        it._worn["dress"].value = True
+        assert it.chosen().wear == named and len(it.controls.worn) == 5
+        it.controls.worn["dress"].value = True
         assert it.chosen().wear == (*named, "dress")
-        it._worn["top"].value = False
+        it.controls.worn["top"].value = False
         assert it.chosen().wear == (there[1], there[0], "dress")
     finally:
         it.close()
@@ -116,9 +120,12 @@ def test_file_contents_in_errors_are_escaped(viewer):
     viewer.add_file("a.bvh", b"<iframe srcdoc='x'>*b*")
     with pytest.raises(PhysXNetError):
         viewer.wait()
-    assert "<iframe" not in viewer._status.content and "&lt;iframe" in viewer._status.content
-    assert "\\*b\\*" in viewer._status.content
-    viewer._widgets["motion"].value = "walk"
+    assert (
+        "<iframe" not in viewer.controls.status.content
+        and "&lt;iframe" in viewer.controls.status.content
+    )
+    assert "\\*b\\*" in viewer.controls.status.content
+    viewer.controls.settings["motion"].value = "walk"
     viewer.wait()
 
 
@@ -161,7 +168,7 @@ def test_viewer_export_matches_the_shown_clip(viewer, tmp_path):
     # A glTF in which nothing moves isn't taken for a motion.
     viewer.add_file("mine.glb", trimesh.load_mesh(tmp_path / "bottom.obj").export(file_type="glb"))
     assert [m.name for m in viewer.wait().garments] == ["bottom", "mine"]
-    viewer._worn["mine.glb"].value = False
+    viewer.controls.worn["mine.glb"].value = False
     viewer.wait()
 
 
@@ -224,7 +231,7 @@ def test_live_cloth_matches_the_clip_from_any_frame(viewer):
 
 
 def test_checkboxes_switch_post_processing(viewer):
-    w = viewer._widgets
+    w = viewer.controls.settings
     assert viewer.chosen().inference == SHORT.inference == Inference()
     w["tta"].value, w["strain"].value = True, False
     chosen = viewer.chosen().inference
@@ -235,23 +242,24 @@ def test_checkboxes_switch_post_processing(viewer):
 
 @pytest.mark.release
 def test_viewer_shows_live_cloth_and_its_time(viewer):
-    viewer._playing.value = False
-    viewer._widgets["weights"].value, viewer._widgets["method"].value = "nano", "network"
-    viewer._widgets["live"].value = True
+    viewer.controls.playing.value = False
+    settings = viewer.controls.settings
+    settings["weights"].value, settings["method"].value = "nano", METHOD_LABELS["network"]
+    viewer.controls.settings["live"].value = True
     shown = viewer.wait()
-    assert shown.choice.live and viewer._pace.visible
+    assert shown.choice.live and viewer.controls.pace.visible
     asked = []
     frame = shown.live.frame
     shown.live.frame = lambda index: asked.append(index) or frame(index)
     for index in (9, 5, 0):
-        viewer._frame.value = index
-    assert asked == [9, 5, 0] and "ms a frame, live" in viewer._pace.content
-    assert "nan" not in viewer._pace.content
-    viewer._widgets["live"].value = False
-    viewer._widgets["method"].value = "lbs"
-    viewer._widgets["weights"].value = SHORT.inference.weights
-    assert viewer.wait().choice == SHORT and not viewer._pace.visible
-    viewer._playing.value = True
+        viewer.controls.frame.value = index
+    assert asked == [9, 5, 0] and "ms a frame, live" in viewer.controls.pace.content
+    assert "nan" not in viewer.controls.pace.content
+    viewer.controls.settings["live"].value = False
+    viewer.controls.settings["method"].value = METHOD_LABELS["lbs"]
+    viewer.controls.settings["weights"].value = SHORT.inference.weights
+    assert viewer.wait().choice == SHORT and not viewer.controls.pace.visible
+    viewer.controls.playing.value = True
 
 
 def test_recorded_page_is_a_single_complete_file(tmp_path):
@@ -275,7 +283,10 @@ def test_view_command_writes_pages_and_serves_until_stopped(tmp_path, capsys, mo
     monkeypatch.delenv("SSH_CONNECTION", raising=False)
     console = Console(file=io.StringIO(), width=200)
     assert view(parse([*words, "--port", "8300"]), console, over=over) == 0
-    assert opened == ["http://127.0.0.1:8300"]
+    assert len(opened) == 1 and re.fullmatch(
+        r"http://127\.0\.0\.1:8300/\?token=[\w-]{22}", opened[0]
+    )
+    assert "other machines" not in console.file.getvalue()
     assert opened[0] in console.file.getvalue()
     monkeypatch.setenv("SSH_CONNECTION", "here")
     assert view(parse([*words, "--port", "8300"]), console, over=over) == 0
@@ -321,7 +332,7 @@ def page(viewer, tmp_path):
 @pytest.mark.skipif(_BROWSER["BROWSER"] is None, reason="no Chromium installed")
 def test_garment_selected_in_a_browser_appears(viewer, page, tmp_path):
     viewer.wait()
-    viewer._playing.value = False
+    viewer.controls.playing.value = False
     page.until("document.body.innerText.includes('bottom')")
     page.until("document.querySelector('canvas') !== null")
 
@@ -354,5 +365,5 @@ def test_garment_selected_in_a_browser_appears(viewer, page, tmp_path):
     assert [m.name for m in shown.garments] == ["bottom", "dress"]
     after = picture(lambda seen: changed(seen, before) > 3e-3)
     assert changed(after, before) > 3e-3, "the picture of the person has changed"
-    viewer._worn["dress"].value = False
+    viewer.controls.worn["dress"].value = False
     viewer.wait()

@@ -1,9 +1,12 @@
 """Entry point: parses the command line, runs a command and reports errors."""
 
+import contextlib
 import importlib
 import os
+import signal
 import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Iterator, Sequence
 from inspect import cleandoc
 from typing import Annotated, Any, NamedTuple, Union
 
@@ -73,7 +76,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
         0 for success; 1 for a broken installation, or if `inspect`, `fit`, `stress`,
         `dataset check`, `doctor` or ``--strict`` finds a problem; 2 for an error in the input;
-        130 if interrupted by Ctrl-C; 141 if the reader of the output closed the pipe.
+        130 if interrupted by Ctrl-C; 141 if the reader of the output closed the pipe; 143 if
+        terminated.
     """
     start()
     words = list(sys.argv[1:] if arguments is None else arguments)
@@ -85,7 +89,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console(stderr=False, markup=False)
     errors = Console(stderr=True, soft_wrap=True)
     try:
-        return _run(command, console)
+        with _stopped_by_sigterm():
+            return _run(command, console)
     except BrokenPipeError:
         # The reader closed the pipe: the flush at exit must not fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -95,10 +100,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         errors.print(f"physxnet: {error}", style="red", markup=False)
         return 1 if isinstance(error, BrokenInstallError) else 2
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         left = "finished parts are kept for the next run" if _resumes(command) else ""
         Console(stderr=True).print(f"physxnet: stopped; {left or 'nothing half-written is left'}.")
-        return 130
+        return 143 if isinstance(stop, _Terminated) else 130
+
+
+class _Terminated(KeyboardInterrupt):
+    """The process was asked to end."""
+
+
+@contextlib.contextmanager
+def _stopped_by_sigterm() -> Iterator[None]:
+    """Lets SIGTERM end a command as Ctrl-C does, so that it removes what it leaves half-written."""
+
+    def stop(*_: object) -> None:
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def print_help(console: Console) -> None:

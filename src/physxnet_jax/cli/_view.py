@@ -8,7 +8,7 @@ from rich.console import Console
 
 from ..errors import PhysXNetError
 from ..files import check_writable
-from ..viewer import Choice, Viewer, record
+from ..viewer import Choice, Viewer, is_loopback, record
 from ._commands import View
 from ._options import check_simulates, with_animation
 from ._progress import progress_bars
@@ -67,7 +67,13 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         return 0
     viewer = Viewer(choice, host=command.host, port=command.port)
     try:
-        console.print(f"viewer at {viewer.url}; Ctrl-C stops it", highlight=False)
+        if not is_loopback(command.host):
+            console.print(
+                f"other machines can reach this page at {command.host}: whoever has its address,"
+                " token included, can upload files and see yours",
+                style="yellow",
+            )
+        console.print(f"viewer at {viewer.url}; Ctrl-C stops it", highlight=False, soft_wrap=True)
         port = viewer.server.get_port()
         if os.environ.get("SSH_CONNECTION"):
             console.print(f"remote access: ssh -L {port}:localhost:{port} this-machine")

@@ -2,6 +2,7 @@
 
 from ._diagram import draw_work_precision as draw_work_precision
 from ._error_report import write_error_report as write_error_report
+from ._guard import is_loopback as is_loopback
 from ._job import Choice as Choice, run_job as run_job
 from ._maps import magnified as magnified, texel_picture as texel_picture
 from ._record import record as record

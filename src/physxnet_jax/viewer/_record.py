@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from ..errors import FormatError
 from ..files import atomic_write
+from ._guard import Guard
 from ._job import Choice, Shown, run_job
 from ._server import start_server
 from ._stage import Stage
@@ -32,7 +33,7 @@ def record(
     if pathlib.Path(path).suffix.lower() != ".html":
         raise FormatError(f"{path}: the page must be an .html file.")
     shown = run_job(choice, progress)
-    server = start_server("127.0.0.1", 8090)
+    server = start_server("127.0.0.1", 8090, Guard("127.0.0.1", lambda _: None))
     try:
         stage = Stage(server.scene, shown)
         serializer = server.get_scene_serializer()
