@@ -3,7 +3,7 @@
 Command: python experiments/picture_viewer.py
 Needs:   Chromium on the path.
 Cost:    two minutes.
-Result:  docs/viewer-network.png, docs/viewer-maps.png, docs/viewer-error.png.
+Result:  docs/viewer-clothes.png, docs/viewer-maps.png, docs/viewer-compare.png.
 """
 
 import pathlib
@@ -17,43 +17,48 @@ import numpy as np
 from physxnet_jax.viewer import Choice, Viewer
 
 DOCS = pathlib.Path(__file__).parents[1] / "docs"
-_SCENE_FILE_KEYS = runpy.run_path(str(DOCS.parent / "tests/browser.py"))
+_BROWSER = runpy.run_path(str(DOCS.parent / "tests/browser.py"))
 # The browser's warning that it draws without a GPU says nothing of the viewer.
 _CLOSE = "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
 
 
 def main() -> None:
-    choice = Choice("walk", ("top", "bottom"), weights="small+relax", frames=60, live=True)
+    choice = Choice("walk", ("shirt", "trousers"), frames=60, live=True)
     viewer = Viewer(choice)
     viewer.wait()
     viewer.controls.playing.value = False
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
-        page = _SCENE_FILE_KEYS["Page"](viewer.url, folder, (1280, 800))
+        page = _BROWSER["Page"](viewer.url, folder, (1400, 900))
         page.until("document.querySelector('canvas') !== null")
         time.sleep(8)
 
-        def shoot(name: str, frame: int, scroll: int = 0) -> None:
+        def shoot(name: str, frame: int, tab: str) -> None:
             viewer.wait()
             viewer.controls.frame.value = frame
             page.run(_CLOSE)
-            page.run(
-                "document.querySelectorAll('div').forEach(d => {if (d.scrollHeight >"
-                f" d.clientHeight + 50) d.scrollTop = {scroll}}})"
+            x, y = page.run(
+                "(() => {const e = [...document.querySelectorAll('*')].filter(b => b.textContent =="
+                f" '{tab}').at(-1).getBoundingClientRect();"
+                " return [e.x + e.width / 2, e.y + e.height / 2]})()"
             )
+            for kind in ("mousePressed", "mouseReleased"):
+                press = {"x": x, "y": y, "button": "left", "clickCount": 1}
+                page.call("Input.dispatchMouseEvent", type=kind, **press)
             time.sleep(5)
             iio.imwrite(DOCS / f"viewer-{name}.png", page.picture().astype(np.uint8))
 
         for frame in range(50):
             viewer.controls.frame.value = frame
-        shoot("network", 20)
-        viewer.controls.settings["live"].value = False
-        viewer.controls.worn["top"].value = viewer.controls.worn["bottom"].value = False
-        viewer.controls.worn["dress"].value = True
+        shoot("clothes", 20, "Clothes")
+        settings, worn = viewer.controls.settings, viewer.controls.worn
+        settings["live"].value = False
+        worn["shirt"].value = worn["trousers"].value = False
+        worn["dress"].value = True
         viewer.controls.show_maps.value = True
-        shoot("maps", 25, 700)
+        shoot("maps", 25, "Export")
         viewer.controls.show_maps.value = False
-        viewer.controls.settings["compare"].value = True
-        shoot("error", 30)
+        settings["compare"].value = True
+        shoot("compare", 30, "Method")
         page.close()
     viewer.close()
 

@@ -38,6 +38,10 @@ class MissingDependencyError(PhysXNetError, ImportError):
     """An optional dependency is missing; the message names the extra that installs it."""
 
 
+class DiskFullError(PhysXNetError, OSError):
+    """A file doesn't fit on its disk; the message gives the file, its size and what is free."""
+
+
 class SimulationError(PhysXNetError, RuntimeError):
     """A rollout ended with a status that marks its result as unreliable."""
 
@@ -85,6 +89,7 @@ def check_counts(owner: object, *names: str) -> None:
 
 __all__ = [
     "BrokenInstallError",
+    "DiskFullError",
     "FormatError",
     "MeshError",
     "MissingDependencyError",

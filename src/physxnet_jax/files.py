@@ -6,20 +6,77 @@ import json
 import math
 import os
 import pathlib
+import platform
+import re
+import shutil
 import tempfile
 import threading
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from .errors import FormatError
+from .errors import DiskFullError, FormatError
+
+# Where less is free, a writer that failed failed for that [bytes].
+_FULL = 1_000_000
+_HOST = f"{zlib.crc32(platform.node().encode()):08x}"
+_PART = re.compile(r"\.part-([0-9a-f]{8})-(\d+)-")
+# Files that the running command reads, by device and inode.
+_inputs: dict[tuple[int, int], pathlib.Path] = {}
+_swept: set[pathlib.Path] = set()
+
+
+@contextlib.contextmanager
+def keep_inputs() -> Iterator[None]:
+    """Within it, files of `add_inputs` aren't replaced by `atomic_write`."""
+    before = dict(_inputs)
+    try:
+        yield
+    finally:
+        _inputs.clear()
+        _inputs.update(before)
+
+
+def add_inputs(*paths: str | pathlib.Path) -> None:
+    """Notes files that a command reads; what doesn't exist is skipped."""
+    for path in paths:
+        with contextlib.suppress(OSError, ValueError):
+            if os.path.isfile(path):
+                found = os.stat(path)
+                _inputs[found.st_dev, found.st_ino] = pathlib.Path(path)
+
+
+def check_replaceable(path: str | pathlib.Path) -> None:
+    """Checks that writing a file destroys nothing that a person may want to keep.
+
+    Raises:
+        FormatError: It is an input of the running command, under whatever name, or read-only.
+    """
+    try:
+        found = os.stat(path)
+    except OSError:
+        return
+    known = _inputs.get((found.st_dev, found.st_ino))
+    if known is not None:
+        same = "" if str(known) == str(path) else f", which is {known}"
+        raise FormatError(f"{path}: this is an input{same}. Choose another output.")
+    if not os.access(path, os.W_OK) or not found.st_mode & 0o222:
+        raise FormatError(f"{path}: this file is read-only. Choose another output.")
 
 
 @contextlib.contextmanager
 def atomic_write(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
     """Yields a temporary path that replaces ``path`` on success and is deleted on failure.
+
+    A link is followed: what it points to is replaced. Temporary files that dead processes left
+    in the folder are removed.
+
+    Raises:
+        FormatError: The file is read-only or an input, see `check_replaceable`.
+        DiskFullError: The disk is full.
 
     Example:
         >>> import tempfile
@@ -30,15 +87,53 @@ def atomic_write(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
         ['a.txt']
     """
     path = pathlib.Path(path)
+    if path.is_symlink():
+        path = path.resolve()
+    check_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    _sweep(path.parent)
     # The name keeps the suffix because some writers choose the format by it. The ids let
     # processes and threads write the same file concurrently.
-    part = path.with_name(f".part-{os.getpid()}-{threading.get_ident()}-{path.name}")
+    ids = f"{_HOST}-{os.getpid()}-{threading.get_ident()}"
+    part = path.with_name(f".part-{ids}-{path.name}")
     try:
         yield part
         part.replace(path)
+    except Exception as error:
+        # Libraries report a full disk in words of their own, or in none.
+        free = shutil.disk_usage(path.parent).free
+        if free < _FULL and not isinstance(error, DiskFullError):
+            size = part.stat().st_size if part.exists() else 0
+            raise DiskFullError(
+                f"{path}: the disk is full. {size / 1e6:.1f} MB were written and"
+                f" {free / 1e6:.1f} MB are free. Free some space or choose another disk."
+            ) from error
+        raise
     finally:
         part.unlink(missing_ok=True)
+
+
+def _sweep(folder: pathlib.Path) -> None:
+    """Removes temporary files of dead processes of this machine, once for each folder."""
+    folder = folder.absolute()
+    if folder in _swept or os.name == "nt":
+        return
+    _swept.add(folder)
+    for left in folder.glob(".part-*"):
+        match = _PART.match(left.name)
+        if match is not None and match[1] == _HOST and not _is_alive(int(match[2])):
+            with contextlib.suppress(OSError):
+                left.unlink()
+
+
+def _is_alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):
+        pass
+    return True
 
 
 def json_text(values: object) -> str:
@@ -97,23 +192,37 @@ def is_file(path: str | pathlib.Path) -> bool:
     return os.path.isfile(path)
 
 
-def check_writable(path: str | pathlib.Path) -> None:
+def check_writable(path: str | pathlib.Path, size: int = 0) -> None:
     """Checks that a file can be written, without creating it.
 
+    Args:
+        path: The file.
+        size: What it will have at least [bytes], if known.
+
     Raises:
-        FormatError: The path is a folder, or nothing can be written there.
+        FormatError: The path is a folder, an input or read-only, or nothing can be written there.
+        DiskFullError: Less is free than it needs.
     """
     path = pathlib.Path(path)
+    if path.is_symlink():
+        path = path.resolve()
     if path.is_dir():
         raise FormatError(f"{path}: this is a folder. Name a file in it.")
+    check_replaceable(path)
     existing = next((p for p in path.absolute().parents if p.exists()), pathlib.Path("/"))
     try:
         with tempfile.TemporaryFile(dir=existing):
             pass
+        free = shutil.disk_usage(existing).free
     except OSError as error:
         raise FormatError(
             f"{path}: nothing can be written there ({error.strerror}). Choose another folder."
         ) from None
+    if free < size:
+        raise DiskFullError(
+            f"{path}: it will have about {size / 1e6:.0f} MB, but {free / 1e6:.0f} MB are free."
+            " Free some space, choose another disk or fewer --frames."
+        )
 
 
 def read_arrays(

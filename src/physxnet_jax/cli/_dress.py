@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from ..body import load_body
+from ..body import NUM_BODY_VERTICES, load_body
 from ..dressing import (
     EXTERNAL_ENGINES,
     Character,
@@ -252,7 +252,9 @@ def _run(
 ) -> tuple[DressedClip, list[pathlib.Path], float]:
     motion = job.motion if isinstance(job.motion, Motion) else job.motion.motion
     if output.out is not None:
-        check_output(output.out, min(motion.num_frames, job.frames or motion.num_frames))
+        frames = min(motion.num_frames, job.frames or motion.num_frames)
+        body = output.body and not output.out.suffix.lower().startswith(".usd")
+        check_output(output.out, frames, NUM_BODY_VERTICES if body else 0)
     began = time.perf_counter()
     clip = dress(
         job.motion,

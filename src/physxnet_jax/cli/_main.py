@@ -1,8 +1,11 @@
 """Entry point: parses the command line, runs a command and reports errors."""
 
 import contextlib
+import dataclasses
 import importlib
 import os
+import pathlib
+import re
 import signal
 import sys
 import threading
@@ -14,6 +17,7 @@ import tyro
 from rich.console import Console
 
 from ..errors import BrokenInstallError, PhysXNetError
+from ..files import add_inputs, keep_inputs
 from ._clock import start
 from ._commands import (
     Calibrate,
@@ -89,7 +93,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console = Console(stderr=False, markup=False)
     errors = Console(stderr=True, soft_wrap=True)
     try:
-        with _stopped_by_sigterm():
+        with _stopped_by_sigterm(), keep_inputs():
+            add_inputs(*_named_files(command))
             return _run(command, console)
     except BrokenPipeError:
         # The reader closed the pipe: the flush at exit must not fail again.
@@ -104,6 +109,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         left = "finished parts are kept for the next run" if _resumes(command) else ""
         Console(stderr=True).print(f"physxnet: stopped; {left or 'nothing half-written is left'}.")
         return 143 if isinstance(stop, _Terminated) else 130
+
+
+# Options that name what is written.
+_WRITTEN = ("out", "preview", "html", "write_scene", "errors", "contact_sheet")
+
+
+def _named_files(value: Any) -> Iterator[str]:
+    """Names in a command that may be files to read; options and parts after them are left out."""
+    if dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            if field.name not in _WRITTEN:
+                yield from _named_files(getattr(value, field.name))
+    elif isinstance(value, tuple | list):
+        for item in value:
+            yield from _named_files(item)
+    elif isinstance(value, str | pathlib.Path):
+        text = str(value)
+        yield from (text, text.partition("#")[0], text.partition("#")[0].rpartition(":")[0])
+        yield from re.split("[#:=,]", text)
 
 
 class _Terminated(KeyboardInterrupt):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..body import load_body
 from ..errors import FormatError
-from ..files import atomic_write, is_file
+from ..files import add_inputs, atomic_write, is_file
 from ..garment import Garment, fabric_of, parse_wear, with_default_fabric, with_fabric
 from ..io import split_part
 from ..motion import Motion, prepare_motion, sudden_turns
@@ -231,6 +231,10 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
     text, words = _read_scene(path)
     shape = load_body().shape(**text["shape"]) if "shape" in text else None
     places = [_resolve_path(path, g["file"]) for g in words]
+    # No command may overwrite what a scene names.
+    add_inputs(
+        path, _resolve_path(path, text["motion"]), *(parse_wear(str(w)).name for w in places)
+    )
     worn, notes = resolve_garments(places, load_body(), shape)
     garments = [
         with_fabric(w, fabric_of(g["fabric"])) if "fabric" in g else w

@@ -1,5 +1,6 @@
 """Writes clips in the format that the file's extension selects."""
 
+import contextlib
 import itertools
 import pathlib
 import re
@@ -20,21 +21,28 @@ from ._usd import check_usd, write_usd
 EXTENSIONS = (".usdc", ".usd", ".usda", ".pc2", ".mdd", ".glb", ".html", ".obj", ".npz")
 # Characters that file names may not contain on some system.
 _INVALID = re.compile(r'[\\/:*?"<>|\x00-\x1f]')
+# What a vertex takes in a frame at least [bytes].
+_VERTEX_BYTES = {".obj": 20, ".npz": 9, ".pc2": 12, ".mdd": 12, ".glb": 12, ".html": 12}
+_VERTEX_BYTES |= {".usdc": 12, ".usd": 12, ".usda": 20}
 
 
-def check_output(path: str | pathlib.Path, frames: int | None = None) -> pathlib.Path:
+def check_output(
+    path: str | pathlib.Path, frames: int | None = None, vertices: int = 0
+) -> pathlib.Path:
     """Checks that a clip can be written to a path, before minutes are spent on computing it.
 
     Args:
         path: Output path.
         frames: Number of frames, if known.
+        vertices: Vertices whose positions are written, as far as they are known.
 
     Returns:
         The path.
 
     Raises:
         FormatError: The extension is unknown (the message lists the known ones), there are too
-            many frames, or the path isn't writable.
+            many frames, or the path isn't writable, is read-only or an input.
+        DiskFullError: Less is free than the clip needs.
         MissingDependencyError: A library that the format needs isn't installed.
     """
     path = pathlib.Path(path)
@@ -46,7 +54,7 @@ def check_output(path: str | pathlib.Path, frames: int | None = None) -> pathlib
         check_usd()
     if path.suffix.lower() in (".glb", ".html"):
         check_gltf(path, frames)
-    check_writable(path)
+    check_writable(path, _VERTEX_BYTES[path.suffix.lower()] * vertices * (frames or 0))
     return path
 
 
@@ -79,10 +87,14 @@ def write_clip(
 
     Raises:
         FormatError: The extension is unknown, or there are too many frames for glTF.
+        DiskFullError: It doesn't fit on the disk.
         MissingDependencyError: A library that the format needs isn't installed.
     """
-    path = check_output(path)
-    suffix = path.suffix.lower()
+    suffix = pathlib.Path(path).suffix.lower()
+    # In USD a skinned body has no positions.
+    moving = [m for m in meshes if not (suffix.startswith(".usd") and m.skinning is not None)]
+    frames = len(meshes[0].positions) if meshes else None
+    path = check_output(path, frames, sum(m.positions.shape[1] for m in moving))
     if suffix.startswith(".usd"):
         return write_usd(path, meshes, fps, velocities=velocities)
     if suffix == ".npz":
@@ -97,31 +109,46 @@ def write_clip(
         write = write_gltf if suffix == ".glb" else write_html
         write(path, meshes, fps)
         return [path]
-    written = []
-    for m in meshes:
-        stem = f"{path.stem}_{_INVALID.sub('_', m.name)}"
-        drawn, library = m.polygons, None
-        if drawn is not None and drawn.materials:
-            library = f"{stem}.mtl"
-            written += write_materials(path.with_name(library), drawn.materials)
-        if suffix == ".obj":
-            for k, x in enumerate(m.positions):
-                frame = path.with_name(f"{stem}_{k:04d}.obj")
-                write_obj(frame, x, m.faces, m.uv, m.uv_faces, polygons=drawn, library=library)
-                written.append(frame)
+    written: list[pathlib.Path] = []
+    with contextlib.ExitStack() as stack:
+        # All files appear at the end, or none.
+        for m in meshes:
+            written += _write_parts(path, suffix, m, fps, stack)
+    if suffix == ".obj":
+        for m in meshes:
             # Files left by a longer clip would be taken for the rest of this one.
             for k in itertools.count(len(m.positions)):
-                left = path.with_name(f"{stem}_{k:04d}.obj")
+                left = path.with_name(f"{_stem(path, m)}_{k:04d}.obj")
                 if not left.is_file():
                     break
                 left.unlink()
-            continue
-        cache = path.with_name(f"{stem}{suffix}")
-        if suffix == ".mdd":
-            write_mdd(cache, m.positions, fps)
-        else:
-            write_pc2(cache, m.positions)
-        shape = cache.with_suffix(".obj")
-        write_obj(shape, m.positions[0], m.faces, m.uv, m.uv_faces, polygons=drawn, library=library)
-        written += [cache, shape]
+    return written
+
+
+def _stem(path: pathlib.Path, mesh: AnimatedMesh) -> str:
+    return f"{path.stem}_{_INVALID.sub('_', mesh.name)}"
+
+
+def _write_parts(
+    path: pathlib.Path, suffix: str, m: AnimatedMesh, fps: float, stack: contextlib.ExitStack
+) -> list[pathlib.Path]:
+    """Writes a mesh as OBJ files or as a cache with one, to be put in place with the stack."""
+    stem = _stem(path, m)
+    drawn, library, written = m.polygons, None, []
+    if drawn is not None and drawn.materials:
+        library = f"{stem}.mtl"
+        written += write_materials(path.with_name(library), drawn.materials)
+
+    def part(name: str) -> pathlib.Path:
+        written.append(path.with_name(name))
+        return stack.enter_context(atomic_write(written[-1]))
+
+    cached = suffix != ".obj"
+    if suffix == ".mdd":
+        write_mdd(part(f"{stem}{suffix}"), m.positions, fps)
+    elif cached:
+        write_pc2(part(f"{stem}{suffix}"), m.positions)
+    for k, x in enumerate(m.positions[:1] if cached else m.positions):
+        name = f"{stem}.obj" if cached else f"{stem}_{k:04d}.obj"
+        write_obj(part(name), x, m.faces, m.uv, m.uv_faces, polygons=drawn, library=library)
     return written

@@ -144,7 +144,7 @@ class Guard:
         return None if fine else kind
 
     def _is_own(self, host: str) -> bool:
-        """Whether ``Host`` names this server: a name that somebody else resolves does not."""
+        """Whether ``Host`` names this server: a name that others resolve does not."""
         try:
             url = urllib.parse.urlsplit(f"//{host}")
             name, port = url.hostname or "", url.port or 80

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
 from ..body import NUM_BODY_VERTICES, load_body
@@ -29,6 +30,17 @@ class Stage:
     def __init__(self, scene: Any, shown: Shown) -> None:
         self.shown = shown
         self._scene = scene
+        self._person = scene.add_frame("/person", show_axes=False)
+        self._middle = _middle(shown)
+        self._floor = scene.add_grid(
+            "/floor",
+            width=20.0,
+            height=20.0,
+            plane="xz",
+            cell_size=0.5,
+            cell_color=(232, 232, 232),
+            section_color=(205, 205, 205),
+        )
         self._bodies = [self._body("body")]
         self._meshes = [(m, np.zeros(3, np.float32), self._mesh(m, "")) for m in shown.garments]
         self._dots = {}
@@ -38,7 +50,7 @@ class Stage:
         for m in shown.garments:
             if m.name in shown.distances:
                 self._dots[m.name] = scene.add_point_cloud(
-                    f"/distance/{m.name}",
+                    f"/person/distance/{m.name}",
                     m.positions[0],
                     heat(shown.distances[m.name][0]),
                     point_size=0.011,
@@ -56,6 +68,10 @@ class Stage:
             worn: Vertices of garments [m] that replace those of the clip.
         """
         shown = self.shown
+        # The camera stays: person and floor move beneath it.
+        away = -self._middle[frame]
+        self._person.position = away
+        self._floor.position = np.array([away[0] % 1.0, 0.0, away[2] % 1.0])
         turns = Rotation.from_matrix(shown.world[frame]).as_quat(scalar_first=True)
         for place, body in zip((0.0 * BESIDE, BESIDE), self._bodies, strict=False):
             for bone, q, p in zip(body.bones, turns, shown.shift[frame] + place, strict=True):
@@ -71,14 +87,14 @@ class Stage:
 
     def clear(self) -> None:
         """Removes all meshes from the scene."""
-        for handle in (*self._bodies, *(h for _, _, h in self._meshes), *self._dots.values()):
-            handle.remove()
+        self._person.remove()
+        self._floor.remove()
 
     def _body(self, name: str) -> Any:
         body = load_body()
         joints = len(body.parents)
         return self._scene.add_mesh_skinned(
-            f"/{name}",
+            f"/person/{name}",
             np.asarray(self.shown.rest[:NUM_BODY_VERTICES], np.float32),
             np.asarray(body.rest_mesh().faces).astype(np.uint32),
             bone_wxyzs=np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (joints, 1)),
@@ -94,12 +110,21 @@ class Stage:
         if mesh.name in self.shown.distances and not folder:
             colour = (205, 205, 205)
         return self._scene.add_mesh_simple(
-            f"/{folder}{mesh.name}",
+            f"/person/{folder}{mesh.name}",
             np.asarray(mesh.positions[0], np.float32),
             np.asarray(mesh.faces).astype(np.uint32),
             color=colour,
             side="double",
         )
+
+
+def _middle(shown: Shown) -> Float[np.ndarray, "frames 3"]:
+    """Where the person is on the floor [m], without swaying."""
+    rest = shown.rest[:NUM_BODY_VERTICES]
+    middle = 0.5 * (rest.min(axis=0) + rest.max(axis=0))
+    path = shown.world[:, 0] @ middle + shown.shift[:, 0]
+    path = gaussian_filter1d(path, 0.5 * shown.clip.fps, axis=0, mode="nearest")
+    return path * np.array([1.0, 0.0, 1.0])
 
 
 def heat(distances: Float[np.ndarray, " vertices"]) -> UInt8[np.ndarray, "vertices 3"]:

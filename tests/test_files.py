@@ -1,0 +1,174 @@
+"""Files are replaced whole or not at all, and no file of a person's is destroyed."""
+
+import contextlib
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from physxnet_jax import files
+from physxnet_jax.errors import DiskFullError, FormatError
+from physxnet_jax.files import add_inputs, atomic_write, check_writable, keep_inputs
+from physxnet_jax.io import AnimatedMesh, check_output, write_clip
+
+
+def write(path, text="new"):
+    with atomic_write(path) as part:
+        part.write_text(text)
+
+
+def parts(folder):
+    return sorted(p.name for p in folder.iterdir() if p.name.startswith(".part"))
+
+
+@pytest.fixture
+def clip():
+    x = np.random.default_rng(0).normal(size=(4, 5, 3)).astype(np.float32)
+    faces = np.array([[0, 1, 2], [2, 3, 4]])
+    return [AnimatedMesh("top", x, faces), AnimatedMesh("bottom", x + 1.0, faces)]
+
+
+def test_a_link_is_followed(tmp_path):
+    there, link = tmp_path / "there.txt", tmp_path / "link.txt"
+    there.write_text("old")
+    link.symlink_to(there)
+    write(link)
+    assert link.is_symlink() and there.read_text() == "new"
+    dangling = tmp_path / "dangling.txt"
+    dangling.symlink_to(tmp_path / "not_yet.txt")
+    write(dangling)
+    assert dangling.is_symlink() and (tmp_path / "not_yet.txt").read_text() == "new"
+
+
+def test_a_read_only_file_stays(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    path.chmod(0o444)
+    for attempt in (write, check_writable):
+        with pytest.raises(FormatError, match="read-only"):
+            attempt(path)
+    assert path.read_text() == "old" and not parts(tmp_path)
+    path.chmod(0o644)
+    write(path)
+    assert path.read_text() == "new"
+
+
+def test_inputs_stay_under_every_name(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    names = [path, tmp_path / "sub" / ".." / "a.txt", tmp_path / "link.txt", tmp_path / "hard.txt"]
+    (tmp_path / "sub").mkdir()
+    names[2].symlink_to(path)
+    os.link(path, names[3])
+    with keep_inputs():
+        add_inputs(path, tmp_path / "missing", "\0", tmp_path)
+        for name in names:
+            for attempt in (write, check_writable):
+                with pytest.raises(FormatError, match="this is an input"):
+                    attempt(name)
+        assert path.read_text() == "old"
+        write(tmp_path / "b.txt")
+    # The command is over.
+    write(path)
+    assert path.read_text() == "new"
+
+
+def test_what_dead_processes_left_is_removed(tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "_swept", set())
+    gone = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True
+    )
+    dead = f".part-{files._HOST}-{int(gone.stdout)}-1-a.txt"
+    kept = [
+        f".part-{files._HOST}-{os.getpid()}-1-a.txt",
+        f".part-00000000-{int(gone.stdout)}-1-a.txt",
+        ".part-mine",
+    ]
+    for name in (dead, *kept):
+        (tmp_path / name).write_text("half")
+    write(tmp_path / "a.txt")
+    assert parts(tmp_path) == sorted(kept)
+
+
+def test_a_full_disk_is_named(tmp_path, monkeypatch, clip):
+    usage = shutil.disk_usage(tmp_path)
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+
+    def fail():
+        with atomic_write(path) as part:
+            part.write_bytes(bytes(3_000_000))
+            raise RuntimeError("words of a library")
+
+    with pytest.raises(RuntimeError, match="words"):
+        fail()
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=1000))
+    with pytest.raises(DiskFullError, match=r"a\.txt: the disk is full\. 3\.0 MB .* 0\.0 MB are"):
+        fail()
+    assert path.read_text() == "old" and not parts(tmp_path)
+    # Before the work, where the size is known.
+    with pytest.raises(DiskFullError, match="it will have about 120 MB, but 0 MB are free"):
+        check_output(tmp_path / "a.pc2", 1000, 10_000)
+    check_output(tmp_path / "a.pc2")
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=100))
+    for suffix in (".obj", ".npz", ".pc2", ".usdc", ".glb"):
+        with pytest.raises(DiskFullError, match="fewer --frames"):
+            write_clip(tmp_path / f"a{suffix}", clip, 30.0)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+
+
+def test_a_sequence_appears_whole_or_not_at_all(tmp_path, clip, monkeypatch):
+    from physxnet_jax.io import _write
+
+    write_obj, calls = _write.write_obj, []
+
+    def failing(*args, **options):
+        calls.append(args[0])
+        if len(calls) == 7:
+            raise OSError("no more")
+        return write_obj(*args, **options)
+
+    for suffix in (".obj", ".mdd"):
+        calls[:] = [None] * (5 if suffix == ".mdd" else 0)
+        monkeypatch.setattr(_write, "write_obj", failing)
+        with pytest.raises(OSError, match="no more"):
+            write_clip(tmp_path / f"a{suffix}", clip, 30.0)
+        assert not list(tmp_path.iterdir())
+        monkeypatch.setattr(_write, "write_obj", write_obj)
+        written = write_clip(tmp_path / f"a{suffix}", clip, 30.0)
+        assert sorted(tmp_path.iterdir()) == sorted(written)
+        assert len(written) == (8 if suffix == ".obj" else 4)
+        for p in written:
+            p.unlink()
+
+
+@pytest.mark.release
+@pytest.mark.skipif(shutil.which("mount") is None, reason="no mount")
+def test_a_disk_that_is_really_full(tmp_path, clip):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    options = ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)]
+    if os.geteuid() != 0 or subprocess.run(options, capture_output=True).returncode:
+        pytest.skip("a small disk can't be mounted here")
+    try:
+        (disk / "filler").write_bytes(bytes(1_600_000))
+        x = np.random.default_rng(0).normal(size=(12, 5000, 3)).astype(np.float32)
+        big = [AnimatedMesh("top", x, clip[0].faces)]
+        for suffix in (".obj", ".npz", ".pc2", ".mdd", ".usdc", ".glb"):
+            with pytest.raises(DiskFullError, match="free"):
+                write_clip(disk / f"a{suffix}", big, 30.0)
+            # The writer itself finds it full too.
+            with (
+                pytest.MonkeyPatch.context() as patch,
+                pytest.raises(DiskFullError, match="the disk is full"),
+            ):
+                patch.setattr("physxnet_jax.io._write.check_output", lambda p, *_: pathlib.Path(p))
+                write_clip(disk / f"a{suffix}", big, 30.0)
+            assert [p.name for p in disk.iterdir()] == ["filler"], suffix
+    finally:
+        with contextlib.suppress(OSError):
+            subprocess.run(["umount", str(disk)], capture_output=True)
