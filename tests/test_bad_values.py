@@ -148,8 +148,12 @@ TURNS = np.tile([1.0, 0.0, 0.0, 0.0], (2, 31, 1))
 
 
 def test_large_quaternions_are_normalized():
-    motion = make_motion(1e200 * TURNS, np.zeros((2, 3)), 30.0)
-    np.testing.assert_array_equal(motion.rotations, TURNS)
+    """Up to a length that no rotation has."""
+    for length in (1e-5, 1e5):
+        motion = make_motion(length * TURNS, np.zeros((2, 3)), 30.0)
+        np.testing.assert_allclose(motion.rotations, TURNS, atol=1e-7)
+    with pytest.raises(MotionError, match="huge quaternion"):
+        make_motion(1e200 * TURNS, np.zeros((2, 3)), 30.0)
 
 
 @pytest.mark.parametrize(

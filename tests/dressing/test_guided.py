@@ -105,6 +105,22 @@ def test_a_stream_gives_the_clip(guided, motion):
 
 
 @pytest.mark.release
+def test_a_stream_follows_a_person_who_walks_away(guided, motion):
+    """Over the distance at which its place moves."""
+    with jax.enable_x64(True):
+        dresser = in_double(guided)
+        q, p = wide((motion.rotations[:FRAMES], motion.root[:FRAMES]))
+        p = p.at[:, 0].add(3.0 * jnp.arange(float(FRAMES)))
+        whole = cloth_of(dresser, q, p)["bottom"]
+        stream = init_stream(dresser, q[:2], p[:2])
+        for k in range(FRAMES):
+            stream, now = step(dresser, stream, q[k], p[k])
+            # The network computes in float32, and 90 m/s are far from what it has seen.
+            assert float(jnp.abs(now["bottom"] - whole[k]).max()) < 1e-5
+        assert float(jnp.linalg.norm(stream.place)) > 16.0
+
+
+@pytest.mark.release
 def test_blocks_of_a_clip_go_on_from_each_other(guided, motion):
     clip = dress(motion, ["bottom"], method="guided", inference=NANO, include_body=False)
     whole = cloth_of(guided, motion.rotations, motion.root)["bottom"]

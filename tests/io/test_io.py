@@ -298,3 +298,35 @@ def test_usd_stores_normals_extent_and_velocities_of_every_frame(tmp_path, clip)
         # Nothing comes to a halt where a clip ends.
         np.testing.assert_allclose(last, before)
         np.testing.assert_allclose(before, 24.0 * (m.positions[4] - m.positions[3]), rtol=1e-4)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_weights_and_cards_that_are_not_finite_are_refused(tmp_path, value):
+    predictor = load_predictor("nano")
+    folder = tmp_path / "w"
+    save_predictor(folder, predictor, name="copy")
+    blob, text = (folder / "weights.safetensors").read_bytes(), (folder / "card.json").read_text()
+    assert load_predictor(folder).config == predictor.config
+    for name in ("encoder.2.norm.mean", "encoder.2.conv.kernel"):
+        tensors = load(blob)
+        tensors[name] = tensors[name].copy()
+        tensors[name].reshape(-1)[3] = value
+        broken = save(tensors)
+        (folder / "weights.safetensors").write_bytes(broken)
+        card = json.loads(text) | {"sha256": hashlib.sha256(broken).hexdigest()}
+        (folder / "card.json").write_text(json.dumps(card))
+        with pytest.raises(WeightsError, match=f"{name} has values that aren't finite"):
+            load_predictor(folder)
+    (folder / "weights.safetensors").write_bytes(blob)
+    card = json.loads(text)
+    card["normalisation"]["velocity"] = value
+    (folder / "card.json").write_text(json.dumps(card))
+    for attempt in (read_card, load_predictor):
+        with pytest.raises(WeightsError, match="isn't a number"):
+            attempt(folder)
+    for wrong in (0.0, -1.0, 1e39):
+        card["normalisation"]["velocity"] = 1.0
+        card["normalisation"]["offset"]["top"] = wrong
+        (folder / "card.json").write_text(json.dumps(card))
+        with pytest.raises(WeightsError, match="normalisation by top"):
+            load_predictor(folder)

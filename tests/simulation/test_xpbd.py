@@ -14,6 +14,7 @@ from physxnet_jax.geometry import mesh_edges
 from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import (
     XPBD,
+    Implicit,
     Scene,
     State,
     _rollout,
@@ -293,6 +294,7 @@ def test_diagnostics_of_a_frame_refer_to_that_frame():
 
 @pytest.mark.release
 def test_company_in_the_batch_changes_no_bit():
+    """Nor company that isn't finite."""
     scene = prepare_scene(Scene((template("bottom"),)))
 
     def first(name):
@@ -300,8 +302,34 @@ def test_company_in_the_batch_changes_no_bit():
         return dataclasses.replace(m, rotations=m.rotations[:5], root=m.root[:5])
 
     person, walker, dancer = (first(n) for n in ("punch", "walk", "spin"))
+    broken = dataclasses.replace(walker, root=walker.root.at[2].set(jnp.nan))
     runs = [
         simulate_batch(scene, [person, other], solver=XPBD(8, 1))[0].positions[0]
-        for other in (walker, dancer)
+        for other in (walker, dancer, broken)
     ]
-    np.testing.assert_array_equal(*runs)
+    assert np.isfinite(runs[0]).all()
+    for other in runs[1:]:
+        np.testing.assert_array_equal(runs[0], other)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_company_changes_no_bit_of_an_implicit_step(order):
+    """Company that needs more iterations of the linear solver, or never ends."""
+    g = sheet(6, pinned=np.arange(4))
+    scene = prepare_scene(Scene((g,), (Gravity(), Stretch(), Bend(), Pin())))
+    solver = Implicit(4, 1, order=order, newton=2, iterations=200)
+    system = make_system(scene, solver)
+    rest = scene.assembly.rest.astype(np.float32)
+    noise = np.random.default_rng(0).normal(size=rest.shape).astype(np.float32)
+    body = load_body()
+    pose = jnp.tile(body.a_pose()[None, None], (3, 2, 1, 1))
+    root = jnp.zeros((3, 2, 3))
+    ends = []
+    for other in (rest, rest + 0.02 * noise, rest * 1.5, np.nan * rest):
+        x = jnp.asarray(np.stack([rest + 1e-5 * noise, other], axis=2))
+        state = State(x, jnp.zeros_like(x))
+        _, moved, _ = advance(system, state, pose, root, solver=solver, fps=FPS)
+        ends.append(np.asarray(moved)[..., 0])
+    assert np.isfinite(ends[0]).all()
+    for end in ends[1:]:
+        np.testing.assert_array_equal(ends[0], end)

@@ -8,6 +8,7 @@ import importlib.resources
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from ..errors import PhysXNetError
@@ -18,6 +19,10 @@ from ._kinematics import forward_kinematics, linear_blend_skinning
 ASSET = "makehuman_cc0.npz"
 ASSET_SHA256 = "e44596f8c2ddb61ada92901a786f12a83f525bced7ef619f11c3f9d414774676"
 NUM_BODY_VERTICES = 13380
+
+
+# Shape parameters beyond which bodies degenerate.
+_SHAPE_LIMITS = (-1.0, 2.0)
 
 
 @pytree
@@ -151,12 +156,29 @@ class Body:
                 f"Unknown shape parameter {sorted(unknown)}; expected one of"
                 f" {', '.join(self.shape_names)}."
             )
-        for name, value in values.items():
-            if not -1.0 <= value <= 2.0:
+        shape = np.asarray([float(values.get(n, 0.0)) for n in self.shape_names], np.float32)
+        return self.checked_shape(jnp.asarray(shape))
+
+    def checked_shape(self, shape: Float[Array, " shapes"] | None) -> Float[Array, " shapes"]:
+        """Shape parameters within their limits; the default shape if None.
+
+        Under `jax.jit`, parameters outside them become NaN, which clears `Clothed.ok`.
+
+        Raises:
+            PhysXNetError: A value is outside [-1, 2], beyond which bodies degenerate.
+        """
+        if shape is None:
+            return self.default_shape()
+        low, high = _SHAPE_LIMITS
+        if isinstance(shape, Tracer):
+            return jnp.where((shape >= low) & (shape <= high), shape, jnp.nan)
+        for name, value in zip(self.shape_names, np.asarray(shape).reshape(-1), strict=False):
+            if not low <= value <= high:
                 raise PhysXNetError(
-                    f"{name}={value}: expected a number from 0 to 1 (limits: -1 and 2)."
+                    f"{name}={value:g}: expected a number from 0 to 1 (limits: {low:g} and"
+                    f" {high:g})."
                 )
-        return jnp.asarray([float(values.get(name, 0.0)) for name in self.shape_names], jnp.float32)
+        return shape
 
     def a_pose(self) -> Float[Array, "joints 4"]:
         """The rest pose: arms 45 degrees down. All identities."""

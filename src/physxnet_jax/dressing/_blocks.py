@@ -72,6 +72,13 @@ class Block:
     positions: dict[str, Float[np.ndarray, "frames vertices 3"]]
     milliseconds: float
 
+    def moved(self, by: Float[np.ndarray, "3"]) -> "Block":
+        """The block with all positions displaced [m]."""
+        if not by.any():
+            return self
+        raw, positions = ({n: x + by for n, x in d.items()} for d in (self.raw, self.positions))
+        return dataclasses.replace(self, raw=raw, positions=positions)
+
 
 def infer_clip(dresser: Dresser, clip: PosedClip) -> Iterator[Block]:
     """Runs a dresser over a clip, one block at a time.

@@ -13,7 +13,7 @@ from ..models import apply_sampled_offsets, normalise, point_features, predict_s
 from ..motion import extrapolate_history
 from ..typing import pytree
 from ._dresser import Dresser
-from ._guided import GuidedState, advance_guided, init_guided
+from ._guided import GuidedState, advance_guided, init_guided, move_guided
 from ._pipeline import bound, infer, limit, predict_cloth, resolve
 from .postprocess import Cloth
 
@@ -26,8 +26,9 @@ class Clothed(Mapping[str, Array]):
     Attributes:
         vertices: Vertices of each garment by name [m], shape
             ``[*frames, vertices, 3]``.
-        ok: Whether all vertices are finite. A non-finite joint affects only the frames
-            whose window contains it.
+        ok: Whether the result can be used. A pose that isn't finite, or a quaternion of almost
+            no length or an enormous one, affects only the frames whose window contains it; their
+            vertices are NaN. Gradients of a loss over the other frames are finite.
     """
 
     vertices: dict[str, Float[Array, "*frames vertices 3"]]
@@ -58,17 +59,74 @@ class Stream:
     Attributes:
         points: Skinned texel points of the last `Dresser.history_length` frames [m],
             oldest first, shape [history, texels, 3]; None for skinning alone.
+        place: Point near the person, relative to which all else is [m].
+        rotations: The last usable pose, as in `Motion`.
+        root: Its root [m].
+        usable: Which of those frames had a usable pose, shape [history].
         guided: Simulated cloth of the last frame; None if it isn't simulated.
     """
 
     points: Float[Array, "history texels 3"] | None
+    place: Float[Array, "3"]
+    rotations: Float[Array, "joints 4"]
+    root: Float[Array, "3"]
+    usable: Bool[Array, " history"]
     guided: GuidedState | None = None
 
 
-def _make_clothed(dresser: Dresser, cloth: tuple[Array, ...]) -> Clothed:
+# Components of a quaternion that states a rotation: from the first to the second.
+_LENGTHS = (1e-6, 1e6)
+# A person who has moved so far from `Stream.place` has another one [m].
+_FAR = 16.0
+
+
+def _make_clothed(
+    dresser: Dresser,
+    cloth: tuple[Array, ...],
+    usable: Bool[Array, "*frames"],
+    place: Float[Array, "3"],
+) -> Clothed:
+    """The result from positions relative to a place, and from which frames saw usable poses."""
     finite = [jnp.all(jnp.isfinite(x), axis=(-2, -1)) for x in cloth]
+    ok = functools.reduce(jnp.logical_and, finite, usable)
     names = (w.name for w in dresser.worn)
-    return Clothed(dict(zip(names, cloth, strict=True)), functools.reduce(jnp.logical_and, finite))
+    shown = (
+        jnp.where(ok[..., None, None], x + jnp.broadcast_to(place, x.shape), jnp.nan) for x in cloth
+    )
+    return Clothed(dict(zip(names, shown, strict=True)), ok)
+
+
+def _is_usable(
+    rotations: Float[Array, "*frames joints 4"], root: Float[Array, "*frames 3"]
+) -> Bool[Array, "*frames"]:
+    """Which poses are finite and have quaternions that state a rotation."""
+    largest = jnp.max(jnp.abs(rotations), axis=-1)
+    low, high = _LENGTHS
+    turned = jnp.all((largest >= low) & (largest <= high), axis=-1)
+    return turned & jnp.all(jnp.isfinite(root), axis=-1)
+
+
+def _hold(
+    rotations: Float[Array, "frames joints 4"], root: Float[Array, "frames 3"]
+) -> tuple[Array, Array, Bool[Array, " frames"]]:
+    """Poses of which those that can't be used are replaced by the last one that can.
+
+    NaN must not enter the computation: its gradient would be NaN in all frames, whatever the loss.
+    """
+    usable = _is_usable(rotations, root)
+    index = jnp.where(usable, jnp.arange(rotations.shape[0]), -1)
+    index = jax.lax.cummax(index)
+    # Before the first usable pose: that one.
+    index = jnp.where(index < 0, jnp.argmax(usable), index)
+    none = ~jnp.any(usable)
+    still = jnp.zeros((4,), rotations.dtype).at[0].set(1.0)
+    rotations = jnp.where(none, still[None, None], rotations[index])
+    return rotations, jnp.where(none, 0.0, root[index]), usable
+
+
+def _on_ground(root: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The point at height 0 below the hips, see `ground_point`."""
+    return jax.lax.stop_gradient(root * jnp.asarray([1.0, 0.0, 1.0], root.dtype))
 
 
 def _check_pose(body: Body, rotations: Array, root: Array, axes: tuple[str, ...]) -> None:
@@ -121,10 +179,18 @@ def clothe(
     _check_pose(dresser.body, rotations, root, ("frames",))
     if rotations.shape[0] == 0:
         raise ValueError("the clip has no frames; clothe needs at least one.")
-    history = extrapolate_history(rotations, root, dresser.history_length(fps))
+    rotations, root, usable = _hold(rotations, root)
+    place = _on_ground(root[0])
+    root = root - place[None]
+    length = dresser.history_length(fps)
+    history = extrapolate_history(rotations, root, length)
     joints = (jnp.concatenate(pair) for pair in zip(history, (rotations, root), strict=True))
     transforms = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*joints)
-    return _make_clothed(dresser, infer(dresser, *transforms, fps)[1])
+    usable = jnp.concatenate([jnp.ones((length,), bool), usable])
+    # A frame is well if all poses that it saw are.
+    shifted = (usable[length - k : usable.shape[0] - k] for k in dresser.seen(fps))
+    well = functools.reduce(jnp.logical_and, shifted)
+    return _make_clothed(dresser, infer(dresser, *transforms, fps)[1], well, place)
 
 
 def init_stream(
@@ -154,14 +220,26 @@ def init_stream(
     _check_pose(dresser.body, rotations, root, ("frames",))
     if not rotations.shape[0]:
         raise ValueError("no pose: pass the first one or two.")
+    rotations, root, _ = _hold(rotations, root)
+    place = _on_ground(root[0])
+    root = root - place[None]
+    length = dresser.history_length(fps)
+    stream = Stream(
+        points=None,
+        place=place,
+        rotations=rotations[0],
+        root=root[0],
+        usable=jnp.ones((length,), bool),
+    )
     if dresser.predictor is None:
-        return Stream(points=None)
+        return stream
     texels = dresser.predictor.texel_points
-    history = extrapolate_history(rotations, root, dresser.history_length(fps))
+    history = extrapolate_history(rotations, root, length)
     r, t = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*history)
     points = jax.vmap(lambda a, b: skin_points(texels.rest, texels.weights, a, b)[0])(r, t)
     scene = dresser.guided
-    return Stream(points=points, guided=None if scene is None else init_guided(scene, r[-1], t[-1]))
+    guided = None if scene is None else init_guided(scene, r[-1], t[-1])
+    return dataclasses.replace(stream, points=points, guided=guided)
 
 
 def clothe_step(
@@ -193,15 +271,37 @@ def clothe_step(
         >>> step = jax.jit(clothe_step, static_argnames="fps", donate_argnames="stream")
     """
     _check_pose(dresser.body, rotations, root, ())
+    usable = _is_usable(rotations, root)
+    rotations = jnp.where(usable, rotations, stream.rotations)
+    stream, root = _follow(stream, jnp.where(usable, root - stream.place, stream.root))
     r, t = dresser.body.transforms(dresser.rest, rotations, root)
     stream, cloth = _predict_step(dresser, stream, r, t, fps)
+    past = jnp.concatenate([stream.usable, usable[None]])
+    well = functools.reduce(jnp.logical_and, (past[-1 - k] for k in dresser.seen(fps)))
+    stream = dataclasses.replace(stream, rotations=rotations, root=root, usable=past[1:])
     if dresser.guided is not None and stream.guided is not None:
         one = tuple(x[0] for x in cloth)
         guided, one = advance_guided(dresser.guided, dresser.worn, stream.guided, one, r, t, fps)
-        return dataclasses.replace(stream, guided=guided), _make_clothed(dresser, one)
-    cloth = limit(dresser, cloth, r[None], t[None])
-    cloth = resolve(dresser, cloth, r[None], t[None])
-    return stream, _make_clothed(dresser, tuple(x[0] for x in cloth))
+        stream = dataclasses.replace(stream, guided=guided)
+    else:
+        cloth = limit(dresser, cloth, r[None], t[None])
+        cloth = resolve(dresser, cloth, r[None], t[None])
+        one = tuple(x[0] for x in cloth)
+    return stream, _make_clothed(dresser, one, well, stream.place)
+
+
+def _follow(stream: Stream, root: Float[Array, "3"]) -> tuple[Stream, Float[Array, "3"]]:
+    """Moves the stream's place below a person who has gone far from it."""
+    ahead = _on_ground(root)
+    ahead = jnp.where(jnp.sum(ahead**2) > _FAR**2, ahead, 0.0)
+    guided = stream.guided
+    moved = dataclasses.replace(
+        stream,
+        place=stream.place + ahead,
+        points=None if stream.points is None else stream.points - ahead[None, None],
+        guided=None if guided is None else move_guided(guided, -ahead),
+    )
+    return moved, root - ahead
 
 
 def _predict_step(

@@ -16,7 +16,7 @@ from ..errors import PhysXNetError
 from ..garment import Garment
 from ..io import AnimatedMesh
 from ..models import BoundGarment, Predictor, load_predictor
-from ..motion import BLOCK, Motion, prepare_motion, slice_motion, sudden_turns
+from ..motion import BLOCK, Motion, ground_point, prepare_motion, slice_motion, sudden_turns
 from ..simulation import Rollout, Status
 from ._blocks import Block, PosedClip, infer_clip, inside_shares, pose_clip
 from ._character import (
@@ -160,19 +160,24 @@ def dress(
         if method == "simulate":
             cloth = _simulate_cloth(garments, person, simulation, stages, progress)
         else:
-            cloth = _infer_cloth(dresser, person.clip, stages, progress, on_block)
+            cloth = _infer_cloth(dresser, person, stages, progress, on_block)
         measured = colliders.result()
     return _assemble_clip(dresser, person, cloth, measured, method, include_body, notes, stages)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Person:
-    """The person to dress: a character, or a body with shape parameters."""
+    """The person to dress: a character, or a body with shape parameters.
+
+    All is computed with the first frame above the origin, as far from it positions are coarse;
+    ``place`` is added to the result.
+    """
 
     body: Body
     shape: Float[Array, " shapes"] | None
     clip: PosedClip
     character: Character | None
+    place: Float[np.ndarray, "3"]
 
     @property
     def floor(self) -> float:
@@ -220,9 +225,11 @@ def _load_person(
         body = load_body() if body is None else body
         whole = prepare_motion(motion, fps=fps, body=body, shape=shape)
         part, past = slice_motion(whole, start, frames)
-        rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+        rest = body.rest_vertices(body.checked_shape(shape))
+        place = np.zeros(3, np.float32) if character is not None else ground_point(part)
+        part, past = (m and m.moved(-place) for m in (part, past))
         clip = pose_clip(body, rest, part, past)
-    return _Person(body=body, shape=shape, clip=clip, character=character)
+    return _Person(body=body, shape=shape, clip=clip, character=character, place=place)
 
 
 def _load_garments(
@@ -281,18 +288,19 @@ def _simulate_cloth(
 
 def _infer_cloth(
     dresser: Dresser,
-    clip: PosedClip,
+    person: _Person,
     stages: list[Stage],
     progress: Progress | None,
     on_block: Callable[[Block], None] | None,
 ) -> _Cloth:
+    clip = person.clip
     # A dresser that simulates has a network too.
     name = INFERENCE_STAGES[(dresser.predictor is not None) + (dresser.guided is not None)]
     blocks: list[Block] = []
     for block in infer_clip(dresser, clip):
         blocks.append(block)
         if on_block is not None:
-            on_block(block)
+            on_block(block.moved(person.place))
         if progress is not None:
             progress(name, min(block.start + BLOCK, clip.num_frames), clip.num_frames)
     times = [b.milliseconds for b in blocks]
@@ -355,7 +363,7 @@ def _assemble_clip(
     fault = sudden_turns(person.body, clip.motion)
     bound = {w.name: w.binding if isinstance(w, BoundGarment) else None for w in dresser.worn}
     return DressedClip(
-        meshes=meshes,
+        meshes=tuple(m.moved(person.place) for m in meshes),
         fps=clip.motion.fps,
         stages=tuple(stages),
         hit_rate={n: None if b is None else float(b.hit_rate) for n, b in bound.items()},
@@ -370,7 +378,7 @@ def _assemble_clip(
             *notes,
         ),
         worst=worst,
-        rollout=cloth.rollout,
+        rollout=cloth.rollout and cloth.rollout.moved(person.place),
         effects=cloth.effects,
     )
 

@@ -79,6 +79,10 @@ class Dresser:
             return 0
         return self.predictor.config.inputs.at_rate(fps).window - 1
 
+    def seen(self, fps: float = 30.0) -> tuple[int, ...]:
+        """How many frames back the poses lie that a frame depends on, see `FeatureConfig.seen`."""
+        return (0,) if self.predictor is None else self.predictor.config.inputs.at_rate(fps).seen
+
     @property
     def outfit(self) -> Outfit:
         """The input from which post-processing steps are prepared."""
@@ -148,7 +152,7 @@ def dress_garments(
 ) -> Dresser:
     """`make_dresser` for garments that are already on the body."""
     inference = Inference() if inference is None else inference
-    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    rest = body.rest_vertices(body.checked_shape(shape))
     if method == "lbs":
         predictor = None
         inference = dataclasses.replace(inference, strain_iterations=0)

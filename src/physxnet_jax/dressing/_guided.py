@@ -224,6 +224,19 @@ def init_guided(
     )
 
 
+def move_guided(state: GuidedState, by: Float[Array, "3"]) -> GuidedState:
+    """The state displaced [m]."""
+    column = by[None, :, None]
+    skin = (s and dataclasses.replace(s, points=s.points + column) for s in state.skin)
+    return dataclasses.replace(
+        state,
+        cloth=dataclasses.replace(state.cloth, position=state.cloth.position + column),
+        skin=tuple(skin),
+        means=state.means + column,
+        translations=state.translations + by[None],
+    )
+
+
 def advance_guided(
     scene: GuidedScene,
     worn: tuple[SkinnedGarment, ...],

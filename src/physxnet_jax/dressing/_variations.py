@@ -29,6 +29,7 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
         The dresser for that shape.
 
     Raises:
+        PhysXNetError: A parameter is outside its limits.
         ValueError: The number of parameters is wrong; or a network of the ``paper`` family
             predicts a dress, whose offsets start from a body with joined legs: use `make_dresser`
             with the shape instead.
@@ -40,7 +41,7 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
         >>> bool(tall.worn[0].rest[:, 1].max() > person.worn[0].rest[:, 1].max())
         True
     """
-    rest = dresser.body.rest_vertices(shape)
+    rest = dresser.body.rest_vertices(dresser.body.checked_shape(shape))
     cloth = tuple(g.rest_vertices(rest) for g in dresser.garments)
     return _varied(dresser, rest, cloth)
 

@@ -34,6 +34,14 @@ class AnimatedMesh:
     polygons: Polygons | None = None
     skinning: "Skinning | None" = None
 
+    def moved(self, by: Float[np.ndarray, "3"]) -> "AnimatedMesh":
+        """The mesh displaced [m]; the same if that is zero."""
+        if not by.any():
+            return self
+        s = self.skinning
+        skinning = s and dataclasses.replace(s, translations=s.translations + by)
+        return dataclasses.replace(self, positions=self.positions + by, skinning=skinning)
+
     @property
     def looks(self) -> list["Look"]:
         """The look of each material, and the mesh's own for faces without one."""

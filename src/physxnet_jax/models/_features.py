@@ -67,6 +67,12 @@ class FeatureConfig:
         return (self.frames - 1) * self.stride + 2 * self.span + 1
 
     @property
+    def seen(self) -> tuple[int, ...]:
+        """How many frames back the poses lie that one prediction sees, itself included."""
+        first = [self.stride * k for k in range(self.frames)]
+        return tuple(sorted({k + self.span * n for k in first for n in range(3)}))
+
+    @property
     def kinds(self) -> tuple[str, ...]:
         """Kinds of channels in order; each has three or three times ``frames`` channels."""
         local = self.family == "local"

@@ -112,12 +112,18 @@ def read_card(weights: str | pathlib.Path = DEFAULT) -> dict[str, Any]:
     """
     path = _folder(weights) / _CARD
     try:
-        card = json.loads(path.read_text())
+        card = json.loads(path.read_text(), parse_constant=_refuse_constant)
     except (ValueError, RecursionError) as error:
-        raise WeightsError(f"{path}: not a card ({error}). Reinstall or copy it again.") from None
+        raise WeightsError(
+            f"{path}: not a card, it is damaged ({error}). Reinstall or copy it again."
+        ) from None
     if not isinstance(card, dict):
-        raise WeightsError(f"{path}: not a card. Reinstall or copy it again.")
+        raise WeightsError(f"{path}: not a card, it is damaged. Reinstall or copy it again.")
     return card
+
+
+def _refuse_constant(word: str) -> None:
+    raise ValueError(f"{word} isn't a number")
 
 
 def weights_size(weights: str | pathlib.Path = DEFAULT) -> int:
@@ -171,7 +177,7 @@ def _model(card: dict[str, Any]) -> ModelConfig:
 def _load(
     weights: str | pathlib.Path, folder: pathlib.Path, custom: nnx.Module | None = None
 ) -> Predictor:
-    card = json.loads((folder / _CARD).read_text())
+    card = read_card(weights)
     blob = (folder / _TENSORS).read_bytes()
     digest = hashlib.sha256(blob).hexdigest()
     if digest != card["sha256"]:
@@ -202,6 +208,17 @@ def _load(
         return _filled(weights, card, model, tensors, graph, state)
 
 
+def _check_finite(weights: str | pathlib.Path, name: str, x: Any, above: float = -np.inf) -> None:
+    values = np.asarray(x, np.float64)
+    # False for NaN too.
+    finite = np.abs(values) <= np.finfo(np.float32).max
+    if not (finite & (values > above)).all():
+        raise WeightsError(
+            f"{weights}: {name} has values that aren't {'positive' if above == 0.0 else 'finite'}."
+            " The training failed, or the file is damaged: use another checkpoint."
+        )
+
+
 def _filled(
     weights: str | pathlib.Path,
     card: dict[str, Any],
@@ -228,6 +245,7 @@ def _filled(
                 f"{weights}: {parameter} {found}; {y.shape} is expected. Use the package version"
                 " that the weights came with."
             )
+        _check_finite(weights, parameter, x)
         leaves.append(x)
     state = jax.tree.unflatten(
         structure, [jnp.asarray(x.astype(y.dtype)) for x, y in zip(leaves, like, strict=True)]
@@ -237,6 +255,8 @@ def _filled(
         for t in model.templates
     }
     n = card["normalisation"]
+    for key, value in {**n, **n["offset"], "offset": 1.0}.items():
+        _check_finite(weights, f"normalisation by {key}", value, above=0.0)
     normalisation = Normalisation(
         jnp.float32(n["velocity"]),
         jnp.float32(n["acceleration"]),

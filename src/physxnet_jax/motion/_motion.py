@@ -18,6 +18,8 @@ from ._source import MAX_JOINT_FRAMES
 _BLOCK = 32
 # A root farther from the origin than this indicates a damaged file [m].
 _FARTHEST = 1e5
+# A quaternion with smaller components, or with components over the inverse, states no rotation.
+_SMALLEST = 1e-6
 
 
 @pytree
@@ -64,6 +66,20 @@ class Motion:
             )
         return Motion(self.rotations[frames], self.root[frames], self.fps / step, name=self.name)
 
+    def moved(self, by: Float[np.ndarray, "3"]) -> "Motion":
+        """The motion displaced [m]; the same if that is zero."""
+        return dataclasses.replace(self, root=self.root + by[None]) if by.any() else self
+
+
+def ground_point(motion: Motion) -> Float[np.ndarray, "3"]:
+    """The point at height 0 below the first frame's hips [m].
+
+    Far from the origin positions are coarse (1 mm at 10 km), so cloth is computed relative to this
+    point: ``motion.moved(-ground_point(motion))``. Its height stays because a floor may have one.
+    """
+    x, _, z = np.asarray(motion.root[0])
+    return np.asarray([x, 0.0, z] if np.isfinite([x, z]).all() else [0.0] * 3, np.float32)
+
 
 def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "motion") -> Motion:
     """A `Motion` from host arrays, checked and normalised.
@@ -76,7 +92,8 @@ def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "mot
 
     Raises:
         MotionError: Wrong shapes, no frames, a rate that isn't positive, a value that
-            isn't finite, or a zero quaternion. The message names the frame and joint.
+            isn't finite, or a quaternion of almost no length or an enormous one. The message names
+            the frame and joint.
     """
     # Checked before copying: an archive of kilobytes may hold gigabytes of zeros.
     shape, places = np.shape(rotations), np.shape(root)
@@ -103,10 +120,12 @@ def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "mot
             " 100 km away. Cut the frame out or interpolate over it."
         )
     largest = np.abs(r).max(axis=2, keepdims=True)
-    if (largest < 1e-6).any():
-        frame, joint, _ = (int(x) for x in np.argwhere(largest < 1e-6)[0])
+    wrong = (largest < _SMALLEST) | (largest > 1.0 / _SMALLEST)
+    if wrong.any():
+        frame, joint, _ = (int(x) for x in np.argwhere(wrong)[0])
+        kind = "zero" if largest[frame, joint, 0] < 1.0 else "huge"
         raise MotionError(
-            f"{name}: frame {frame}, joint {joint} has a zero quaternion; use"
+            f"{name}: frame {frame}, joint {joint} has a {kind} quaternion; use"
             " (1, 0, 0, 0) for no rotation."
         )
     r = r / largest
@@ -198,6 +217,8 @@ def animate(
     """
     check_joints(body, motion)
     frames = motion.num_frames
+    place = ground_point(motion)
+    motion = motion.moved(-place)
     pick = np.minimum(np.arange(-(-frames // _BLOCK) * _BLOCK), frames - 1)
     rotations = np.asarray(motion.rotations)[pick].reshape(-1, _BLOCK, *motion.rotations.shape[1:])
     root = np.asarray(motion.root)[pick].reshape(-1, _BLOCK, 3)
@@ -205,7 +226,8 @@ def animate(
         np.asarray(_animate_block(body, rest, vertices, weights, q, p))
         for q, p in zip(rotations, root, strict=True)
     ]
-    return jnp.asarray(np.concatenate(blocks)[:frames])
+    positions = np.concatenate(blocks)[:frames]
+    return jnp.asarray(positions + place if place.any() else positions)
 
 
 def check_joints(body: Body, motion: Motion) -> None:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
@@ -24,8 +25,8 @@ _TAU = 2 * np.pi
 # Smoothing widths of the hips' horizontal and vertical path [s]: without smoothing, a change of
 # the standing foot would accelerate the hips by several g.
 _SIGMA_XZ, _SIGMA_Y = 0.08, 0.03
-# Least rate at which steps are integrated [1/s], so that clips are the same at every fps.
-_MIN_STEP_RATE = 120.0
+# Rate at which steps are integrated [1/s].
+_STEP_RATE = 120.0
 Time = Float[np.ndarray, " frames"]
 Turns = Mapping[str, Float[np.ndarray, "frames 3"]]
 
@@ -112,8 +113,11 @@ def _punch(t: Time) -> tuple[Turns, Time]:
 
 
 def _turn(t: Time) -> tuple[Turns, Time]:
-    yaw = 0.5 * np.pi * (_ease(t, 0.3, 1.3) - 2 * _ease(t, 1.7, 3.1) + _ease(t, 3.3, 4.0))
-    lead = np.gradient(yaw, t) * 0.06
+    def heading(t: Time) -> Time:
+        return 0.5 * np.pi * (_ease(t, 0.3, 1.3) - 2 * _ease(t, 1.7, 3.1) + _ease(t, 3.3, 4.0))
+
+    yaw, h = heading(t), 1.0 / _STEP_RATE
+    lead = (heading(t + h) - heading(t - h)) / (2 * h) * 0.06
     step = 0.25 * np.abs(np.sin(2 * yaw))
     turns = {
         "Hips": _about(_Y, yaw),
@@ -240,32 +244,45 @@ def procedural_clip(
     if name not in CLIPS:
         raise MotionError(f"No built-in clip '{name}'; there are {', '.join(CLIPS)}.")
     body = load_body() if body is None else body
-    often = max(1, int(np.ceil(_MIN_STEP_RATE / fps)))
-    rate = often * fps
-    lead = int(np.ceil(4 * _SIGMA_XZ * rate))  # margin of the smoothing at both ends
-    kept = slice(lead, lead + often * max(1, round(seconds * fps)), often)
-    if (kept.stop + 2 * lead) * len(body.parents) > MAX_JOINT_FRAMES:
+    count = max(1, round(seconds * fps))
+    lead = int(np.ceil(4 * _SIGMA_XZ * _STEP_RATE))  # margin of the smoothing at both ends
+    last = lead + int(np.ceil((count - 1) / fps * _STEP_RATE))
+    often = max(1, int(np.ceil(_STEP_RATE / fps)))
+    if max(last + 2 * lead, often * count) * len(body.parents) > MAX_JOINT_FRAMES:
         raise MotionError(
             f"{seconds:g} s at {fps:g} frames per second are too many frames. Request a shorter"
             " clip or a lower rate."
         )
-    t = np.arange(-lead, kept.stop + lead) / rate
+    # Steps are integrated at one rate, so that clips cover the same ground at every fps.
+    t = np.arange(-lead, last + 1 + lead) / _STEP_RATE
     turns, air = CLIPS[name](t)
+    still = np.zeros((len(t), 3))
+    stepping = make_motion(_local_rotations(body, shape, turns), still, _STEP_RATE, name=name)
+    path = CubicSpline(t, _planted_root(body, stepping, air, shape))
+    fine = np.arange(-1, often * count + 1) / (often * fps)
+    local = _local_rotations(body, shape, CLIPS[name](fine)[0])[1:-1:often]
+    root = path(fine[1:-1:often])
+    root[:, [0, 2]] -= root[0, [0, 2]]
+    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    return stand_on_floor(body, make_motion(local, root, fps, name=name), rest)
+
+
+def _local_rotations(
+    body: Body, shape: Float[Array, " shapes"] | None, turns: Turns
+) -> Float[np.ndarray, "frames joints 4"]:
+    """Joint rotations relative to their parents, wxyz, from turns about the world's axes."""
     down = {"Left": np.array([0.14, -1.0, 0.02]), "Right": np.array([-0.14, -1.0, 0.02])}
     stance = {f"{s}{b}": d for s, d in down.items() for b in ("Arm", "ForeArm")}
     stance |= {f"{s}{b}": -_Y for s in down for b in ("UpLeg", "Leg")}
     aligned = align_global(body, stance, shape)
-    local = np.zeros((len(t), len(body.parents), 4))
+    frames = len(next(iter(turns.values())))
+    local = np.zeros((frames, len(body.parents), 4))
     for j, (joint, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
         # world = change * aligned, so the local turn is conjugated by the parent's.
-        turn = Rotation.from_rotvec(turns.get(joint, np.zeros((len(t), 3))))
+        turn = Rotation.from_rotvec(turns.get(joint, np.zeros((frames, 3))))
         up = aligned[parent].inv() if parent >= 0 else Rotation.identity()
         local[:, j] = (up * turn * aligned[j]).as_quat(scalar_first=True)
-    motion = make_motion(local, np.zeros((len(t), 3)), rate, name=name)
-    root = _planted_root(body, motion, air, shape)[kept]
-    root[:, [0, 2]] -= root[0, [0, 2]]
-    rest = body.rest_vertices(body.default_shape() if shape is None else shape)
-    return stand_on_floor(body, make_motion(local[kept], root, fps, name=name), rest)
+    return local
 
 
 def _planted_root(

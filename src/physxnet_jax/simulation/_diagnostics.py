@@ -90,6 +90,12 @@ class Rollout:
     name: str = ""
     vertices: int | None = None
 
+    def moved(self, by: Float[np.ndarray, "3"]) -> "Rollout":
+        """The rollout with all positions displaced [m]."""
+        if not by.any():
+            return self
+        return dataclasses.replace(self, positions=tuple(x + by for x in self.positions))
+
     @property
     def finite(self) -> Bool[np.ndarray, " frames"]:
         """Which frames contain neither NaN nor infinity."""

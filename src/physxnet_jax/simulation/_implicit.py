@@ -142,13 +142,19 @@ class Implicit(Solver):
                 x, r, p, rz, n = s
                 ap = apply(p)
                 curvature = dot(p, ap)
-                # A batch member that has converged or broken down keeps its solution.
-                alpha = jnp.where(curvature > 0, rz / jnp.where(curvature > 0, curvature, 1.0), 0.0)
-                x, r = x + alpha * p, r - alpha * ap
-                z = precondition(r)
-                new = dot(r, z)
-                beta = jnp.where(rz > 0, new / jnp.where(rz > 0, rz, 1.0), 0.0)
-                return x, r, z + beta * p, new, n + 1
+                # A batch member that has converged or broken down keeps its solution, however
+                # long the others take.
+                going = (rz > threshold) & (curvature > 0)
+                alpha = rz / jnp.where(going, curvature, 1.0)
+                ahead, left = x + alpha * p, r - alpha * ap
+                z = precondition(left)
+                new = dot(left, z)
+                beta = new / jnp.where(going, rz, 1.0)
+                found = (ahead, left, z + beta * p, new)
+                # Of rank 3 all: members are the last axis. Broken ones end.
+                kept = [jnp.where(going, a, b) for a, b in zip(found, (x, r, p, rz), strict=True)]
+                kept[3] = jnp.where(going, new, jnp.minimum(rz, threshold))
+                return *kept, n + 1
 
             z = precondition(b)
             state = (jnp.zeros_like(b), b, z, dot(b, z), jnp.zeros((), jnp.int32))

@@ -14,7 +14,7 @@ from .._environment import clear_caches_if_full
 from ..body import Body
 from ..devices import make_mesh
 from ..errors import SimulationError
-from ..motion import Motion, animate
+from ..motion import Motion, animate, ground_point
 from ._advance import advance_on, start_state
 from ._assembly import float32
 from ._diagnostics import Rollout
@@ -165,11 +165,14 @@ def simulate_batch(
     used = min(len(jax.local_devices()), len(motions)) if devices is None else devices
     missing = -len(motions) % max(used, 1)
     mesh = make_mesh(len(motions) + missing, used, local=True)
-    padded = [*motions, *missing * motions[-1:]]
+    places = [ground_point(m) for m in motions]
+    local = [m.moved(-p) for m, p in zip(motions, places, strict=True)]
+    padded = [*local, *missing * local[-1:]]
     solver = PRESETS["standard"].at_rate(motions[0].fps) if solver is None else solver
     # Limited to tracing and execution: the rest of the process keeps its precision.
     with jax.enable_x64(solver.precision == "float64"):
-        return _roll(scene, padded, solver, progress, energies, resume, mesh)[: len(motions)]
+        found = _roll(scene, padded, solver, progress, energies, resume, mesh)
+    return [r.moved(p) for r, p in zip(found, places, strict=False)]
 
 
 def _roll(
