@@ -40,6 +40,7 @@ def test_a_few_stretched_or_pinched_places_raise_nothing():
         (Status.PINCHED, {"pinched": 25.0}),
         (Status.CROSSED, {"layers_crossed": 6.0}),
         (Status.OVERFLOW, {"overflow": 1.0}),
+        (Status.COLLAPSED, {"collapsed": 0.2}),
         (Status.STRAINED, {"strain_p99": float("nan")}),
     ],
 )

@@ -32,6 +32,8 @@ class Status(enum.IntFlag):
     """A grid cell of `SelfContact` received more vertices than it can hold."""
     OFF = 512
     """A garment's waist, upper border or neckline has slid more than 8 cm along the body."""
+    COLLAPSED = 1024
+    """More than one edge in ten has lost four fifths of its length."""
 
     @property
     def advice(self) -> str:
@@ -44,6 +46,8 @@ OFF = 0.08
 """A garment whose waist, upper border or neckline has slid farther than this is off [m]."""
 # Single vertices in armpits do no harm: this share of all is "many".
 _MANY = 0.02
+# Folds shorten no edge: cloth that has lost these is a heap or a point.
+_COLLAPSED = 0.1
 # Between layers less than that shows.
 _CROSSING = 0.005
 _ADVICE = {
@@ -56,6 +60,7 @@ _ADVICE = {
     Status.PINCHED: "limbs pass through the body: correct the motion there",
     Status.CROSSED: "less wind, or --accuracy fine",
     Status.OVERFLOW: "a coarser mesh: physxnet fit GARMENT --edge-length",
+    Status.COLLAPSED: "cloth has shrunk to a heap: look at its first frame and its rest shape",
     Status.OFF: "a closer fit, or hold it: skirt:hold=waist",
 }
 _CAUSES = {
@@ -76,7 +81,8 @@ class Rollout:
         diagnostics: Values of each frame: ``finite``, ``speed_max`` [m/s],
             ``worst_vertex`` (the fastest), ``residual_max`` and ``residual_p99``
             (1 is the tolerance of 0.5 mm). The scene's effects add ``strain_max``,
-            ``strain_p99`` [1], ``penetration_max`` [m], ``inside_share``, ``missed``,
+            ``strain_p99`` [1], ``collapsed`` (share of edges that have lost their length),
+            ``penetration_max`` [m], ``inside_share``, ``missed``,
             ``pinched`` (vertices), ``layers_crossed``, ``layers_depth`` [m],
             ``self_gap`` [m] and ``overflow``; ``energy_...`` [J] if requested. ``slipped`` [m] is
             how far the garment that slid farthest has slid, see `slipped`.
@@ -132,6 +138,7 @@ class Rollout:
             | bit(Status.PINCHED, d.get("pinched", nothing) > many)
             | bit(Status.CROSSED, d.get("layers_crossed", nothing) > _CROSSING * vertices)
             | bit(Status.OVERFLOW, d.get("overflow", nothing) > 0)
+            | bit(Status.COLLAPSED, ~(d.get("collapsed", nothing) <= _COLLAPSED))
             | bit(Status.OFF, d.get("slipped", nothing) > OFF)
         )
 

@@ -12,9 +12,9 @@ from ...errors import check_numbers
 from ...typing import pytree
 from .._assembly import Assembly
 from .._effect import Effect, Prepared, Rest
-from .._quantile import upper_quantile
 from ._colored import Colored, Constraint, Group, color_constraints, directed
 from ._hinge import sound
+from ._strain_report import strain_report
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,4 +174,4 @@ class _Membrane(Colored):
             w = g.law[one] * x[1] + g.law[two] * x[2]
             strain.append(jnp.sqrt(jnp.sum(w * w, axis=1)) - 1.0)
         every = jnp.concatenate(strain)
-        return {"strain_max": every.max(axis=0), "strain_p99": upper_quantile(every, 0.99)}
+        return strain_report(every)

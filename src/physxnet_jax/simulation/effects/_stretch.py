@@ -13,8 +13,8 @@ from ...geometry import mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly, float32, norm
 from .._effect import Clock, Effect, Prepared, Rest, Step
-from .._quantile import upper_quantile
 from ._colored import ColorGroup, bundled, color_groups, column, directed, sweep
+from ._strain_report import strain_report
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,4 +203,4 @@ class _Stretch(Prepared):
     def diagnose(self, displacement: Array, context: tuple) -> dict[str, Array]:
         span, rest = self._spans(displacement, context), self.springs.length[:, 0]
         every = (jnp.sqrt(jnp.sum(span * span, axis=1)) - rest) / jnp.maximum(rest, 1e-4)
-        return {"strain_max": every.max(axis=0), "strain_p99": upper_quantile(every, 0.99)}
+        return strain_report(every)
