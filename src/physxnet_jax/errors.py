@@ -5,12 +5,27 @@ import numbers
 
 # Messages quote file contents, which can be arbitrarily long.
 _MOST, _LAST = 1200, 500
+# What a terminal obeys instead of showing: C0 but for line ends and tabs, DEL and C1; and what
+# turns the direction of text.
+_CONTROLS = {*range(32), *range(127, 160), *range(0x202A, 0x202F), *range(0x2066, 0x206A)} - {9, 10}
+_ESCAPED = {c: f"\\x{c:02x}" if c < 256 else f"\\u{c:04x}" for c in _CONTROLS}
+
+
+def visible(text: str) -> str:
+    r"""Text with control characters as escapes: what comes from a file may carry some.
+
+    Example:
+        >>> visible("LeftArm" + chr(27) + "c")
+        'LeftArm\\x1bc'
+    """
+    return text.translate(_ESCAPED)
 
 
 class PhysXNetError(Exception):
     """Base class of errors this package raises on purpose; long messages lose their middle."""
 
     def __init__(self, text: str = "") -> None:
+        text = visible(text)
         if len(text) > _MOST:
             text = f"{text[: _MOST - _LAST]} … {text[-_LAST:]}"
         super().__init__(text)
@@ -99,4 +114,5 @@ __all__ = [
     "WeightsError",
     "check_counts",
     "check_numbers",
+    "visible",
 ]

@@ -40,6 +40,9 @@ def saved(folder, suffix, trousers):
         chart = trimesh.visual.TextureVisuals(uv=uv[pairs[:, 1]])
         mesh = trimesh.Trimesh(v[pairs[:, 0]], index.reshape(-1, 3), process=False, visual=chart)
         mesh.export(path)
+    elif suffix == ".usdz":
+        utils = pytest.importorskip("pxr.UsdUtils")
+        assert utils.CreateNewUsdzPackage(str(saved(folder, ".usdc", trousers)), str(path))
     else:
         write_clip(path, [AnimatedMesh("trousers", v[None], faces, uv, uv_faces)], 30.0)
     return path
@@ -216,3 +219,10 @@ def test_mirrored_transforms_keep_faces_pointing_outwards(tmp_path, kind):
     )
     ring = mesh.vertices[mesh.polygons.corners.reshape(-1, 3)] - [-2, 0, 0]
     assert np.linalg.det(ring).sum() > 0
+
+
+def test_damaged_packages_are_refused(trousers, tmp_path):
+    path = saved(tmp_path, ".usdz", trousers)
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(FormatError, match=r"trousers\.usdz"):
+        read_mesh(path)

@@ -112,9 +112,9 @@ class Inspect:
     """
 
     files: tyro.conf.Positional[tuple[pathlib.Path, ...]]
-    """Garments (.obj, .glb, .gltf, .usd, .usda, .usdc, .ply, .stl; coat.glb#sleeves is one mesh of
-    several), motions (.bvh, .amc, .npz, .pkl, .vrma, .glb and .gltf without a mesh, built-in clips)
-    or rigged persons (.vrm, .glb, .gltf)."""
+    """Garments (.obj, .glb, .gltf, .usd, .usda, .usdc, .usdz, .ply, .stl; coat.glb#sleeves is one
+    mesh of several), motions (.bvh, .amc, .npz, .pkl, .vrma, .glb and .gltf without a mesh,
+    built-in clips) or rigged persons (.vrm, .glb, .gltf)."""
     motion: bool = False
     """Inspect the animation of a .glb or .gltf file that also has a mesh."""
     source_fps: float | None = None

@@ -34,6 +34,7 @@ from ._commands import (
     Tailor,
     View,
 )
+from ._console import PlainConsole
 from ._experiment_commands import Adapt, Bench, Dataset, Evaluate, Stress, Train
 
 
@@ -86,12 +87,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     start()
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
-        print_help(Console(highlight=False))
+        print_help(PlainConsole(highlight=False))
         return 0 if words else 2
     command = parse(words)
     # Paths and names may contain brackets.
-    console = Console(stderr=False, markup=False)
-    errors = Console(stderr=True, soft_wrap=True)
+    console = PlainConsole(stderr=False, markup=False)
+    errors = PlainConsole(stderr=True, soft_wrap=True)
     try:
         with _stopped_by_sigterm(), keep_inputs():
             add_inputs(*_named_files(command))
@@ -107,7 +108,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 1 if isinstance(error, BrokenInstallError) else 2
     except KeyboardInterrupt as stop:
         left = "finished parts are kept for the next run" if _resumes(command) else ""
-        Console(stderr=True).print(f"physxnet: stopped; {left or 'nothing half-written is left'}.")
+        PlainConsole(stderr=True).print(
+            f"physxnet: stopped; {left or 'nothing half-written is left'}."
+        )
         return 143 if isinstance(stop, _Terminated) else 130
 
 
@@ -207,7 +210,7 @@ def _run(command: Any, console: Console) -> int:
     is_quiet = _flag(command, "json") or _flag(command, "quiet")
     # `inspect`, `clips` and `doctor` have no result other than their output.
     if is_quiet and not isinstance(command, Inspect | Clips | Doctor):
-        console = Console(quiet=True, markup=False)
+        console = PlainConsole(quiet=True, markup=False)
     module = importlib.import_module(f".{handler.module}", __package__)
     return getattr(module, handler.function)(command, console)
 

@@ -28,7 +28,7 @@ from ..io import (
 from ..motion import Motion, retarget_to_rig, split_animation
 
 CHARACTER_FORMATS = (
-    *(".glb", ".gltf", ".vrm", ".usdc", ".usd", ".usda"),
+    *(".glb", ".gltf", ".vrm", ".usdc", ".usd", ".usda", ".usdz"),
     *(".pc2", ".mdd", ".npz", ".obj"),
 )
 """Extensions that `read_character` supports."""

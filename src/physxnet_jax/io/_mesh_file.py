@@ -12,7 +12,7 @@ from ._animated_mesh import StaticMesh
 from ._obj import read_obj
 from ._source_mesh import SourceMesh, joined, named, welded
 
-GARMENT_FORMATS = (".obj", ".glb", ".gltf", ".usdc", ".usd", ".usda", ".ply", ".stl")
+GARMENT_FORMATS = (".obj", ".glb", ".gltf", ".usdc", ".usd", ".usda", ".usdz", ".ply", ".stl")
 """Extensions that `read_mesh` supports."""
 
 _MAX_BYTES = 500_000_000
@@ -34,8 +34,8 @@ def read_mesh(path: str | pathlib.Path) -> StaticMesh:
     joined, but ``coat.glb#sleeves`` reads the mesh ``sleeves`` alone, ``#a+b`` two of them.
 
     Args:
-        path: An ``.obj``, ``.glb``, ``.gltf``, ``.usd``, ``.usda``, ``.usdc``, ``.ply`` or
-            ``.stl``.
+        path: An ``.obj``, ``.glb``, ``.gltf``, ``.usd``, ``.usda``, ``.usdc``, ``.usdz``,
+            ``.ply`` or ``.stl``.
 
     Raises:
         FormatError: The format is unknown, the mesh doesn't exist, or the file is damaged.
