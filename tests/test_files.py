@@ -11,8 +11,15 @@ import numpy as np
 import pytest
 
 from physxnet_jax import files
-from physxnet_jax.errors import DiskFullError, FormatError
-from physxnet_jax.files import add_inputs, atomic_write, check_writable, keep_inputs
+from physxnet_jax.errors import BusyError, DiskFullError, FormatError
+from physxnet_jax.files import (
+    add_inputs,
+    atomic_write,
+    check_writable,
+    claim,
+    claims,
+    keep_inputs,
+)
 from physxnet_jax.io import AnimatedMesh, check_output, write_clip
 
 
@@ -172,3 +179,91 @@ def test_a_disk_that_is_really_full(tmp_path, clip):
     finally:
         with contextlib.suppress(OSError):
             subprocess.run(["umount", str(disk)], capture_output=True)
+
+
+OWNER = """
+import sys, time
+from physxnet_jax.files import claim
+with claim(sys.argv[1]):
+    print("claimed", flush=True)
+    time.sleep(float(sys.argv[2]))
+"""
+
+
+def owner(path, seconds):
+    """Another process that has claimed a path, for some seconds."""
+    words = [sys.executable, "-c", OWNER, str(path), str(seconds)]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline().strip() == "claimed"
+    process.stdout.close()
+    return process
+
+
+def test_what_another_process_has_claimed_is_refused(tmp_path):
+    target = tmp_path / "run"
+    process = owner(target, 60.0)
+    try:
+        for _ in range(2):
+            with pytest.raises(BusyError, match=f"run: in use by process {process.pid} on"):
+                with claim(target):
+                    pass
+        with claim(tmp_path / "other"):
+            pass
+    finally:
+        # The owner dies without a chance to tidy up.
+        process.kill()
+        process.wait()
+    with claim(target), pytest.raises(BusyError, match=f"process {os.getpid()} on"):
+        with claim(target):
+            pass
+    with claim(target):
+        pass
+    assert not list(tmp_path.iterdir()), "no lock is left"
+
+
+def test_who_waits_comes_after_the_owner(tmp_path):
+    process = owner(tmp_path / "cache.json", 1.0)
+    with claim(tmp_path / "cache.json", wait=True):
+        # Its last words were spoken.
+        assert process.wait(20) == 0
+
+
+def test_a_decorated_function_claims_what_its_argument_names(tmp_path):
+    @claims("folder", unless=lambda: free)
+    def work(x, folder=None):
+        return x, list(tmp_path.iterdir())
+
+    free = False
+    assert work(1) == (1, []) and work(2, None) == (2, [])
+    assert work(3, tmp_path / "a")[1] == work(3, folder=tmp_path / "a")[1] != []
+    with claim(tmp_path / "a"):
+        with pytest.raises(BusyError):
+            work(4, tmp_path / "a")
+        free = True
+        assert work(5, tmp_path / "a")[0] == 5
+
+
+def test_long_work_is_refused_where_another_process_is_at_it(tmp_path):
+    from physxnet_jax.data import DatasetConfig, build_dataset, write_protocol
+    from physxnet_jax.dressing import adapt
+    from physxnet_jax.garment import template
+    from physxnet_jax.motion import procedural_clip, save_motion
+    from physxnet_jax.simulation import Scene, simulate
+    from physxnet_jax.training import TrainConfig, train
+
+    clip, scene = procedural_clip("walk", seconds=0.2), Scene((template("bottom"),))
+    motions = tmp_path / "motions"
+    motions.mkdir()
+    save_motion(motions / "walk.npz", clip)
+    write_protocol(motions)
+    there = tmp_path / "there"
+    with claim(there):
+        for work in (
+            lambda: simulate(scene, clip, resume=there),
+            lambda: adapt("bottom", resume=there),
+            lambda: train(TrainConfig(), [], there),
+            lambda: build_dataset(DatasetConfig(), there, motions),
+        ):
+            with pytest.raises(BusyError, match=f"there: in use by process {os.getpid()}"):
+                work()
+    assert not there.exists()

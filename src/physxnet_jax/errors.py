@@ -57,6 +57,10 @@ class DiskFullError(PhysXNetError, OSError):
     """A file doesn't fit on its disk; the message gives the file, its size and what is free."""
 
 
+class BusyError(PhysXNetError, RuntimeError):
+    """Another process writes to a folder; the message names it and its machine."""
+
+
 class SimulationError(PhysXNetError, RuntimeError):
     """A rollout ended with a status that marks its result as unreliable."""
 
@@ -104,6 +108,7 @@ def check_counts(owner: object, *names: str) -> None:
 
 __all__ = [
     "BrokenInstallError",
+    "BusyError",
     "DiskFullError",
     "FormatError",
     "MeshError",

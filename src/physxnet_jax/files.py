@@ -1,6 +1,8 @@
 """Atomic file writing, JSON logs and safe reading of untrusted archives."""
 
 import contextlib
+import functools
+import inspect
 import io
 import json
 import math
@@ -13,12 +15,15 @@ import tempfile
 import threading
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-from .errors import DiskFullError, FormatError
+from .errors import BusyError, DiskFullError, FormatError
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 # Where less is free, a writer that failed failed for that [bytes].
 _FULL = 1_000_000
@@ -134,6 +139,83 @@ def _is_alive(process: int) -> bool:
     except (OSError, OverflowError):
         pass
     return True
+
+
+@contextlib.contextmanager
+def claim(path: str | pathlib.Path, *, wait: bool = False) -> Iterator[None]:
+    """Within it, no other process can claim the same file or folder.
+
+    The system releases the claim of a process that dies, however it does.
+
+    Args:
+        path: What is written to; it need not exist.
+        wait: Wait for another owner to finish instead of raising.
+
+    Raises:
+        BusyError: Another process, or another thread, has it.
+    """
+    path = pathlib.Path(path).absolute()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lock = path.with_name(f".{path.name}.lock")
+    while True:
+        file = os.open(lock, os.O_RDWR | os.O_CREAT, 0o644)
+        try:
+            _lock(file, wait)
+            # Its last owner may have removed it meanwhile: then it locks nothing.
+            with contextlib.suppress(FileNotFoundError):
+                if os.path.samestat(os.fstat(file), os.stat(lock)):
+                    break
+        except OSError:
+            # Not the lock: whoever has it may have written nothing yet.
+            owner = os.read(file, 200).decode(errors="replace").strip() or "another process"
+            os.close(file)
+            raise BusyError(
+                f"{path}: in use by {owner}. Wait until it has finished, or choose another folder."
+            ) from None
+        os.close(file)
+    try:
+        os.truncate(file, 0)
+        os.write(file, f"process {os.getpid()} on {platform.node()}".encode())
+        yield
+    finally:
+        with contextlib.suppress(OSError):
+            lock.unlink()
+        os.close(file)
+
+
+def claims(
+    argument: str, *, unless: Callable[[], object] = lambda: False
+) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+    """Decorates a function that claims what an argument names, unless that is None.
+
+    Args:
+        argument: Name of the argument.
+        unless: Called each time; if true, nothing is claimed.
+    """
+
+    def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def claiming(*args: _P.args, **kwargs: _P.kwargs) -> _T:
+            path = signature.bind(*args, **kwargs).arguments.get(argument)
+            with contextlib.nullcontext() if path is None or unless() else claim(path):
+                return function(*args, **kwargs)
+
+        return claiming
+
+    return decorate
+
+
+def _lock(file: int, wait: bool) -> None:
+    if os.name == "nt":
+        import msvcrt
+
+        msvcrt.locking(file, msvcrt.LK_LOCK if wait else msvcrt.LK_NBLCK, 1)  # pyright: ignore
+    else:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
 
 
 def json_text(values: object) -> str:

@@ -1,5 +1,6 @@
 """Builds a dataset: simulates every action with every template."""
 
+import contextlib
 import dataclasses
 import functools
 import math
@@ -14,6 +15,7 @@ import numpy as np
 
 from ..body import Body
 from ..errors import FormatError
+from ..files import claim
 from ..garment import Garment, template
 from ..jobs import Job, Report, run_jobs
 from ..motion import (
@@ -88,6 +90,7 @@ def build_dataset(
         FormatError: ``root`` holds another dataset, an action of ``only`` isn't available,
             or ``upper_from`` selects the action itself.
         MotionError: ``folder`` holds no protocol.
+        BusyError: Another process builds this dataset, or this shard of it.
     """
     folder = pathlib.Path(folder).absolute()
     root = root if "://" in str(root) else pathlib.Path(root).absolute()
@@ -110,6 +113,28 @@ def build_dataset(
                 f"upper_from is {config.upper_from}: with {number} actions in the split"
                 f" '{split}', that is the action itself."
             )
+    with _claimed(root, shard):
+        return _build(config, root, folder, actions, shard, only, report, ray)
+
+
+def _claimed(root: Where, shard: tuple[int, int]) -> contextlib.AbstractContextManager[None]:
+    """Shards are built side by side, but each by one process."""
+    if isinstance(root, str):
+        return contextlib.nullcontext()
+    part = "" if shard == (0, 1) else f"-{shard[0]}-of-{shard[1]}"
+    return claim(root.with_name(root.name + part))
+
+
+def _build(
+    config: DatasetConfig,
+    root: Where,
+    folder: pathlib.Path,
+    actions: list[Action],
+    shard: tuple[int, int],
+    only: tuple[str, ...],
+    report: Report | None,
+    ray: str | None,
+) -> int:
     everyone = actions
     actions = [a for a in actions if not only or a.name in only]
     open_dataset(root, _note(config))

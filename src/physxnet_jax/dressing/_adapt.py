@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from ..body import Body, load_body
 from ..errors import MotionError, PhysXNetError, WeightsError
-from ..files import atomic_write
+from ..files import atomic_write, claims
 from ..garment import Garment
 from ..models import (
     Generator,
@@ -69,6 +69,7 @@ class Adapted:
     seconds: tuple[float, float]
 
 
+@claims("resume")
 def adapt(
     garment: Garment | str | pathlib.Path,
     *,
@@ -106,6 +107,7 @@ def adapt(
         The network and what it gained. Its other decoders and its encoder are unchanged.
 
     Raises:
+        BusyError: Another process adapts with the same ``resume``.
         PhysXNetError: The garment can't be worn by this network, a motion can't be read, or the
             folder to resume from belongs to another call.
         WeightsError: The network isn't a `Generator` as it was loaded, but folded, say.

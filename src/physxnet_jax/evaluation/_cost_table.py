@@ -12,7 +12,7 @@ from .._version import __version__
 from ..data import Outfit, Worn
 from ..dressing import Inference, Simulation, make_dresser
 from ..errors import PhysXNetError
-from ..files import atomic_write
+from ..files import atomic_write, claim
 from ..garment import DEFAULT_KINDS, TEMPLATES, Template, tailor
 from ..models import read_card
 from ..motion import BLOCK, Motion, load_motion
@@ -189,15 +189,16 @@ class _Clock:
 
     def _store(self, known: dict[str, float], key: str, ms: float) -> None:
         known[key] = ms
-        # Another process may have cached times meanwhile.
-        cached = _read(self._path)
-        if cached.get("machine") == self._machine:
-            for name, times in cached["times"].items():
-                mine = self.times.setdefault(name, {})
-                mine.update({k: v for k, v in times.items() if k not in mine})
-        with atomic_write(self._path) as part:
-            cached = {"machine": self._machine, "times": self.times}
-            part.write_text(json.dumps(cached, indent=1) + "\n")
+        with claim(self._path, wait=True):
+            # Another process may have cached times meanwhile.
+            cached = _read(self._path)
+            if cached.get("machine") == self._machine:
+                for name, times in cached["times"].items():
+                    mine = self.times.setdefault(name, {})
+                    mine.update({k: v for k, v in times.items() if k not in mine})
+            with atomic_write(self._path) as part:
+                cached = {"machine": self._machine, "times": self.times}
+                part.write_text(json.dumps(cached, indent=1) + "\n")
 
 
 def select_method(

@@ -14,6 +14,7 @@ from .._environment import clear_caches_if_full
 from ..body import Body
 from ..devices import make_mesh
 from ..errors import SimulationError
+from ..files import claims
 from ..motion import Motion, animate, ground_point
 from ._advance import advance_on, start_state
 from ._assembly import float32
@@ -124,6 +125,7 @@ def simulate(
     return out
 
 
+@claims("resume")
 def simulate_batch(
     scene: Scene | PreparedScene,
     motions: list[Motion],
@@ -155,6 +157,7 @@ def simulate_batch(
     Raises:
         SimulationError: No motion, motions of different frame rates, or a folder that
             belongs to another rollout.
+        BusyError: Another process simulates with the same ``resume``.
         PhysXNetError: This machine has fewer devices.
     """
     if not motions:

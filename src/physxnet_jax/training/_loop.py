@@ -23,7 +23,7 @@ from ..data import (
 )
 from ..devices import at_home, make_mesh, own_rows, repeated, split
 from ..errors import PhysXNetError
-from ..files import append_line, atomic_write
+from ..files import append_line, atomic_write, claims
 from ..models import (
     Predictor,
 )
@@ -37,6 +37,8 @@ from ._step import eval_step, train_step
 _Report = Callable[[int, int, dict[str, float]], None]
 
 
+# Processes of one run share its folder.
+@claims("folder", unless=jax.process_index)
 def train(
     config: TrainConfig,
     sequences: Items[Sequence | Where | Entry],
@@ -70,6 +72,7 @@ def train(
         The trained predictor.
 
     Raises:
+        BusyError: Another process trains in the folder.
         PhysXNetError: Too many consecutive non-finite updates, or the folder holds another run.
         FormatError: No usable data for training or validation.
     """
