@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from physxnet_jax.simulation import Rollout, Status
+from physxnet_jax.garment import square_sheet
+from physxnet_jax.simulation import (
+    XPBD,
+    Rollout,
+    Scene,
+    Status,
+    prepare_scene,
+    settle_on_static_body,
+)
+from physxnet_jax.simulation.effects import Bend, Stretch
 
 QUIET = {
     "finite": 1.0,
@@ -51,3 +60,17 @@ def test_each_flag_is_raised_by_its_own_quantity(flag, change):
 def test_every_flag_says_what_to_do():
     assert all(len(flag.advice) > 10 for flag in Status)
     assert (Status.FAST | Status.INSIDE).advice == ""
+
+
+def test_a_sheet_that_has_collapsed_to_a_point_is_flagged():
+    """Its edges have no direction in which they could grow; beside it one that has."""
+    sheet = square_sheet(7)
+    scene = prepare_scene(Scene((sheet,), (Stretch(), Bend())))
+    point = np.repeat(np.asarray(sheet.mesh.vertices)[:1], 49, axis=0)
+    noise = 1e-4 * np.random.default_rng(0).normal(size=point.shape)
+    found = [
+        settle_on_static_body(scene, 12, solver=XPBD(32, 1), start=start).status
+        for start in (point, point + noise)
+    ]
+    assert all(s & Status.COLLAPSED for s in found[0])
+    assert not found[1][-1] & Status.COLLAPSED
