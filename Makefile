@@ -8,7 +8,7 @@ SRC := $(shell find src tests experiments -name '*.py' 2>/dev/null)
 # Many processes load the same libraries: the first leaves them compiled.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-release test-nightly check docs format clean
+.PHONY: demo test test-release test-nightly check docs bom format clean
 
 # More extras of pyproject.toml: `make test EXTRAS=cluster` also tests Ray.
 EXTRAS ?=
@@ -47,6 +47,11 @@ check: $(VENV)/.ready
 
 docs: $(VENV)/.ready
 	$(BIN)/python -m sphinx -W -q -b html docs docs/_build/html
+
+# Bill of materials of the locked versions: CycloneDX 1.5.
+bom: $(VENV)/.ready
+	mkdir -p dist
+	$(BIN)/uv export --frozen --quiet --format cyclonedx1.5 --extra usd --extra gltf --extra mesh --extra viewer --extra render --extra train --extra export --extra cluster --output-file dist/physxnet_jax.cdx.json >/dev/null
 
 format: $(VENV)/.ready
 	$(BIN)/ruff check --fix .
