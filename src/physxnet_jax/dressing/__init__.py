@@ -19,6 +19,7 @@ from ._clothe import (
     clothe as clothe,
     clothe_step as clothe_step,
     init_stream as init_stream,
+    pad_frames as pad_frames,
 )
 from ._dress import (
     INFERENCE_STAGES as INFERENCE_STAGES,

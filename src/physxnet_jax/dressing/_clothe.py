@@ -6,8 +6,11 @@ from collections.abc import Iterator, Mapping
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
+from .._environment import clear_caches_if_full
 from ..body import Body, skin_points
 from ..models import apply_sampled_offsets, normalise, point_features, predict_sampled
 from ..motion import extrapolate_history
@@ -153,6 +156,10 @@ def clothe(
 
     Poses before frame 0 are extrapolated at constant velocity, see `extrapolate_history`.
 
+    Outside of such transformations the clip is padded to one of a few lengths, so that clips of
+    any lengths share a few compiled programs. Within your own `jax.jit` each length is a program:
+    pass what `pad_frames` makes, and cut the result.
+
     Args:
         dresser: From `make_dresser`.
         rotations: Joint rotations relative to their parents, unit quaternions wxyz, as in
@@ -179,6 +186,62 @@ def clothe(
     _check_pose(dresser.body, rotations, root, ("frames",))
     if rotations.shape[0] == 0:
         raise ValueError("the clip has no frames; clothe needs at least one.")
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves((dresser, rotations, root))):
+        return _clothe(dresser, rotations, root, fps)
+    clear_caches_if_full()
+    padded = pad_frames(rotations, root)
+    found = _clothe_jitted(dresser, *padded, fps)
+    return jax.tree.map(lambda x: _cut(x, rotations.shape[0]), found)
+
+
+def pad_frames(
+    rotations: Float[Array, "frames joints 4"], root: Float[Array, "frames 3"]
+) -> tuple[Float[Array, "padded joints 4"], Float[Array, "padded 3"]]:
+    """Repeats the last pose of a clip up to one of a few lengths: 1, 2, 4, 8, 16, 24, 32, 48, ...
+
+    Frames of `clothe` don't depend on later ones: cut its result to the clip's length.
+
+    Args:
+        rotations: Joint rotations.
+        root: Positions of the root joint [m].
+
+    Example:
+        >>> still = jnp.zeros((37, 31, 4)), jnp.zeros((37, 3))
+        >>> [x.shape[0] for x in pad_frames(*still)]
+        [48, 48]
+    """
+    frames = rotations.shape[0]
+    length = _padded_length(frames)
+    if length == frames:
+        return rotations, root
+    # On the host: another length would be another program here too.
+    index = np.minimum(np.arange(length), frames - 1)
+    q, p = (jnp.asarray(np.asarray(x)[index]) for x in (rotations, root))
+    return q, p
+
+
+def _padded_length(frames: int) -> int:
+    whole = 1 << max(frames - 1, 0).bit_length()
+    less = 3 * whole // 4
+    return less if whole > 16 and less >= frames else whole
+
+
+def _cut(x: Array, frames: int) -> Array:
+    """The first frames; on the host where that costs little, for the reason above."""
+    if x.shape[0] == frames:
+        return x
+    (device, *others) = x.devices()
+    if not others and device.platform == "cpu":
+        return jax.device_put(np.asarray(x)[:frames], device)
+    return x[:frames]
+
+
+def _clothe(
+    dresser: Dresser,
+    rotations: Float[Array, "frames joints 4"],
+    root: Float[Array, "frames 3"],
+    fps: float,
+) -> Clothed:
     rotations, root, usable = _hold(rotations, root)
     place = _on_ground(root[0])
     root = root - place[None]
@@ -191,6 +254,9 @@ def clothe(
     shifted = (usable[length - k : usable.shape[0] - k] for k in dresser.seen(fps))
     well = functools.reduce(jnp.logical_and, shifted)
     return _make_clothed(dresser, infer(dresser, *transforms, fps)[1], well, place)
+
+
+_clothe_jitted = jax.jit(_clothe, static_argnames="fps")
 
 
 def init_stream(

@@ -66,6 +66,10 @@ def extrapolate_history(
     known = jnp.isfinite(q).all() & jnp.isfinite(p).all()
     q, p = jnp.where(known, q, rotations[0]), jnp.where(known, p, root[0])
     step = safe_normalize(quaternion_multiply(rotations[0], quaternion_conjugate(q)))
+    # What is still stays still to the bit; gradients are those of the turn.
+    still = jnp.zeros_like(step).at[..., 0].set(1.0)
+    same = jnp.all(rotations[0] == q, axis=-1, keepdims=True)
+    step = step + jax.lax.stop_gradient(jnp.where(same, still - step, 0.0))
 
     def further(now: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple]:
         last, at = quaternion_multiply(step, now[0]), now[1] + (root[0] - p)
