@@ -1,6 +1,7 @@
 """Files are replaced whole or not at all, and no file of a person's is destroyed."""
 
 import contextlib
+import errno
 import os
 import pathlib
 import shutil
@@ -219,6 +220,24 @@ def test_what_another_process_has_claimed_is_refused(tmp_path):
     with claim(target):
         pass
     assert not list(tmp_path.iterdir()), "no lock is left"
+
+
+def test_without_locks_of_the_file_system_work_goes_on(tmp_path, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+
+    def fail(code):
+        def flock(*_):
+            raise OSError(code, os.strerror(code))
+
+        monkeypatch.setattr(fcntl, "flock", flock)
+
+    fail(errno.ENOLCK)
+    with claim(tmp_path / "run"):
+        pass
+    # Any other failure is that failure, not another owner.
+    fail(errno.EIO)
+    with pytest.raises(OSError, match=os.strerror(errno.EIO)), claim(tmp_path / "run"):
+        pass
 
 
 def test_who_waits_comes_after_the_owner(tmp_path):

@@ -1,6 +1,7 @@
 """Atomic file writing, JSON logs and safe reading of untrusted archives."""
 
 import contextlib
+import errno
 import functools
 import inspect
 import io
@@ -145,7 +146,8 @@ def _is_alive(process: int) -> bool:
 def claim(path: str | pathlib.Path, *, wait: bool = False) -> Iterator[None]:
     """Within it, no other process can claim the same file or folder.
 
-    The system releases the claim of a process that dies, however it does.
+    The system releases the claim of a process that dies, however it does. Where a file system has
+    no locks, nothing is claimed.
 
     Args:
         path: What is written to; it need not exist.
@@ -165,13 +167,16 @@ def claim(path: str | pathlib.Path, *, wait: bool = False) -> Iterator[None]:
             with contextlib.suppress(FileNotFoundError):
                 if os.path.samestat(os.fstat(file), os.stat(lock)):
                     break
-        except OSError:
-            # Not the lock: whoever has it may have written nothing yet.
+        except (BlockingIOError, PermissionError):
+            # Whoever has it may have written nothing yet.
             owner = os.read(file, 200).decode(errors="replace").strip() or "another process"
             os.close(file)
             raise BusyError(
                 f"{path}: in use by {owner}. Wait until it has finished, or choose another folder."
             ) from None
+        except OSError:
+            os.close(file)
+            raise
         os.close(file)
     try:
         os.truncate(file, 0)
@@ -215,7 +220,11 @@ def _lock(file: int, wait: bool) -> None:
     else:
         import fcntl
 
-        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
+                raise
 
 
 def json_text(values: object) -> str:
