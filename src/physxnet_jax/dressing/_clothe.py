@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float
 from .._environment import clear_caches_if_full
 from ..body import Body, skin_points
 from ..models import apply_sampled_offsets, normalise, point_features, predict_sampled
-from ..motion import extrapolate_history
+from ..motion import ROTATION_LENGTHS, extrapolate_history
 from ..typing import pytree
 from ._dresser import Dresser
 from ._guided import GuidedState, advance_guided, init_guided, move_guided
@@ -77,8 +77,6 @@ class Stream:
     guided: GuidedState | None = None
 
 
-# Components of a quaternion that states a rotation: from the first to the second.
-_LENGTHS = (1e-6, 1e6)
 # A person who has moved so far from `Stream.place` has another one [m].
 _FAR = 16.0
 
@@ -104,7 +102,7 @@ def _is_usable(
 ) -> Bool[Array, "*frames"]:
     """Which poses are finite and have quaternions that state a rotation."""
     largest = jnp.max(jnp.abs(rotations), axis=-1)
-    low, high = _LENGTHS
+    low, high = ROTATION_LENGTHS
     turned = jnp.all((largest >= low) & (largest <= high), axis=-1)
     return turned & jnp.all(jnp.isfinite(root), axis=-1)
 

@@ -12,6 +12,7 @@ from ._gltf import (
 from ._inspect import MotionInspection as MotionInspection, inspect_motion as inspect_motion
 from ._load import load_motion as load_motion, save_motion as save_motion
 from ._motion import (
+    ROTATION_LENGTHS as ROTATION_LENGTHS,
     Motion as Motion,
     animate as animate,
     body_animation as body_animation,

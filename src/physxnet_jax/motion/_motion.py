@@ -18,8 +18,8 @@ from ._source import MAX_JOINT_FRAMES
 _BLOCK = 32
 # A root farther from the origin than this indicates a damaged file [m].
 _FARTHEST = 1e5
-# A quaternion with smaller components, or with components over the inverse, states no rotation.
-_SMALLEST = 1e-6
+ROTATION_LENGTHS = (1e-6, 1e6)
+"""A quaternion whose largest component is smaller or larger states no rotation."""
 
 
 @pytree
@@ -120,7 +120,7 @@ def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "mot
             " 100 km away. Cut the frame out or interpolate over it."
         )
     largest = np.abs(r).max(axis=2, keepdims=True)
-    wrong = (largest < _SMALLEST) | (largest > 1.0 / _SMALLEST)
+    wrong = (largest < ROTATION_LENGTHS[0]) | (largest > ROTATION_LENGTHS[1])
     if wrong.any():
         frame, joint, _ = (int(x) for x in np.argwhere(wrong)[0])
         kind = "zero" if largest[frame, joint, 0] < 1.0 else "huge"
