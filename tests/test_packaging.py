@@ -26,7 +26,11 @@ EXTRAS = {
         "import physxnet_jax as px; from physxnet_jax.dressing import export_dresser;"
         " export_dresser('dresser', px.make_dresser(['bottom'], inference=px.Inference(weights='nano')))"
     ),
-    "viewer": "from physxnet_jax.viewer._server import start_server; start_server('127.0.0.1', 8400)",
+    "viewer": (
+        "from physxnet_jax.viewer._guard import Guard;"
+        " from physxnet_jax.viewer._server import start_server;"
+        " start_server('127.0.0.1', 8400, Guard('127.0.0.1', lambda _: None))"
+    ),
 }
 
 pytestmark = pytest.mark.release
