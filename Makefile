@@ -33,7 +33,7 @@ test-release: $(VENV)/.ready
 # On this Python the longest tests; on the others the quick ones.
 NIGHTLY_PYTHONS ?= python3.12 python3.13
 test-nightly: $(VENV)/.ready
-	$(BIN)/python -m pytest -m nightly
+	PHYSXNET_RECORD=experiments/results $(BIN)/python -m pytest -m nightly
 	for python in $(NIGHTLY_PYTHONS); do \
 		$(MAKE) test PYTHON=$$python VENV=.venv-$$python || exit 1; \
 	done

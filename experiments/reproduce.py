@@ -41,11 +41,11 @@ WEIGHTS = ROOT / "src/physxnet_jax/models/weights"
 # Rows of clothes with ease, and of the fitted garments that the paper's network learned from.
 CLOTHES, FITTED = RESULTS / "test_errors.json", RESULTS / "fitted_errors.json"
 METHODS = {
-    CLOTHES: (*("lbs", "nano+relax+push", "base+relax+push", "base+guided", "perturbed"),),
-    FITTED: (
-        *("lbs", "nearest", "mlp", "small", "small+relax+push"),
-        *("paper", "paper+push", "draft", "perturbed"),
+    CLOTHES: (
+        *("lbs", "nano+relax+push", "small+relax+push", "base+relax+push"),
+        *("base+guided", "perturbed"),
     ),
+    FITTED: ("lbs", "nearest", "mlp", "paper", "paper+push", "draft", "perturbed"),
 }
 # What README.md shows of them.
 SHORT = {
@@ -67,7 +67,7 @@ EACH = {
 }
 NETWORKS = {CLOTHES: ("base+relax+push", "base+guided"), FITTED: ("paper", "paper-blender")}
 # Rows of fitted_errors.md that the page leaves out.
-LEFT_OUT = ("small", "paper+push", "blender-22+push")
+LEFT_OUT = ("paper+push", "blender-22+push")
 # The paper's order.
 ACTIONS = (
     *("jump", "walking", "moon walk", "chinese dance", "punch", "balancing", "ballet"),
@@ -89,11 +89,11 @@ SOFT = ("moon walk", "balancing", "walking")
 ABRUPT = ("strong gesture", "jump", "punch")
 COPIED = (
     *("oracle", "accuracy_cost", "peers", "engines", "training"),
-    *("blender_import", "blender_extension", "layers", "adapt", "unseen"),
+    *("blender_import", "blender_extension", "layers", "adapt", "unseen", "laptop"),
 )
 DOCUMENTS = (
     *("docs/reproduction.md", "docs/accuracy-cost.md", "docs/garments.md"),
-    *("docs/stability.md", "docs/blender.md", "README.md"),
+    *("docs/stability.md", "docs/blender.md", "docs/reliability.md", "README.md"),
 )
 
 
@@ -145,6 +145,7 @@ def tables() -> dict[str, str]:
         "datasets": dataset_table(),
         "sizes": sizes_table(),
         "stress": stress_table(),
+        "reliability": reliability_table(),
     }
     found = ((name, RESULTS / f"{name}.md") for name in COPIED)
     return blocks | {name: path.read_text() for name, path in found if path.is_file()}
@@ -230,6 +231,18 @@ def stress_table() -> str:
         cells = [case, r["quantity"], f"{r['bound']:g}", *values]
         lines.append(f"| {' | '.join(cells)} |")
         last = r["case"]
+    return "\n".join(lines)
+
+
+def reliability_table() -> str:
+    """What tests with PHYSXNET_RECORD have measured of promises."""
+    lines = ["| promise | case | tries | failures | measured |", "|---|---|---|---|---|"]
+    last = ""
+    for r in json.loads((RESULTS / "reliability.json").read_text()):
+        promise = r["promise"] if r["promise"] != last else ""
+        figure = f"{r['figure']:.4g} {r['unit']}"
+        lines.append(f"| {promise} | {r['case']} | {r['tries']} | {r['failures']} | {figure} |")
+        last = r["promise"]
     return "\n".join(lines)
 
 

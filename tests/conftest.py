@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import json
 import os
 import pathlib
 import resource
@@ -104,6 +105,32 @@ def data_dir() -> pathlib.Path:
     if not (path / "mocap" / "ACTIONS.csv").is_file():
         pytest.skip(f"no motion data at {path}: set PHYSXNET_DATA")
     return path
+
+
+@pytest.fixture
+def promise():
+    """Records a measured figure of docs/reliability.md, where PHYSXNET_RECORD says to.
+
+    Called with the promise, the case, the figure and its unit, and the tries and failures if more
+    than one was made.
+    """
+    from physxnet_jax.files import claim, write_json
+
+    def record(promise, case, figure, unit, *, tries=1, failures=0):
+        folder = os.environ.get("PHYSXNET_RECORD")
+        if folder is None:
+            return
+        path = pathlib.Path(folder) / "reliability.json"
+        row = {
+            **{"promise": promise, "case": case, "tries": tries, "failures": failures},
+            **{"figure": float(f"{figure:.4g}"), "unit": unit},
+        }
+        with claim(path, wait=True):
+            rows = json.loads(path.read_text()) if path.is_file() else []
+            others = [r for r in rows if (r["promise"], r["case"]) != (promise, case)]
+            write_json(path, sorted([*others, row], key=lambda r: (r["promise"], r["case"])))
+
+    return record
 
 
 @pytest.fixture(scope="session")

@@ -27,7 +27,7 @@ from physxnet_jax.motion import (
 
 _SAMPLES = runpy.run_path(str(pathlib.Path(__file__).with_name("samples.py")))
 bvh = _SAMPLES["standing_bvh"]
-_FUZZ = runpy.run_path(str(pathlib.Path(__file__).with_name("test_fuzz.py")))
+_FUZZ = runpy.run_path(str(pathlib.Path(__file__).with_name("fuzz") / "readers.py"))
 
 
 def test_unmodified_reference_figure_is_read(tmp_path):

@@ -144,3 +144,108 @@ def test_a_lost_training_process_ends_the_run_which_resumes(tmp_path):
     assert not (tmp_path / "killed/weights.npz").exists()
     finish(*both(20), start(tmp_path / "plain"))
     assert np.abs(weights(tmp_path / "killed") - weights(tmp_path / "plain")).max() < 1e-5
+
+
+# Words of a command, and its outputs; a name with a star stands for several files.
+LONG = {
+    "dress": (
+        "dress walk --wear bottom --weights nano --substeps 4 --frames 96 --fps 30 -o out.npz",
+        ("out.npz",),
+    ),
+    "dress to OBJ": (
+        "dress walk --wear bottom --method network --weights nano --frames 48 -o out.obj",
+        ("*.obj",),
+    ),
+    "simulate": (
+        "simulate walk --wear bottom --accuracy draft --frames 40 -o out.pc2",
+        ("*.pc2", "*.obj"),
+    ),
+}
+# Kills itself at the n-th file that is put in place: just before that, or just after.
+IN_A_WRITE = """
+import os, pathlib, signal, sys
+left, after = int(sys.argv.pop(1)), sys.argv.pop(1) == "after"
+replace = pathlib.Path.replace
+def dying(self, target):
+    global left
+    left -= 1
+    if left == 0 and not after:
+        os.kill(os.getpid(), signal.SIGKILL)
+    done = replace(self, target)
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return done
+pathlib.Path.replace = dying
+"""
+MAIN = "import sys\nfrom physxnet_jax.cli import main\nsys.exit(main())\n"
+
+
+def started(folder, words, before="", *more):
+    folder.mkdir(exist_ok=True)
+    command = [sys.executable, "-c", before + MAIN, *more, *words.split()]
+    return subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+
+def results(folder, patterns):
+    return {p.name: p.read_bytes() for name in patterns for p in sorted(folder.glob(name))}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """The bytes of a command's outputs, and its time [s]."""
+    known = {}
+
+    def run(name):
+        if name not in known:
+            words, patterns = LONG[name]
+            folder = tmp_path_factory.mktemp("undisturbed")
+            for _ in range(2):
+                # The second time programs are compiled, as in the runs that are killed.
+                begun = time.monotonic()
+                assert started(folder, words).wait(600) == 0
+                seconds = time.monotonic() - begun
+            assert {p.name for p in folder.iterdir()} == set(results(folder, patterns))
+            known[name] = results(folder, patterns), seconds
+        return known[name]
+
+    return run
+
+
+def killed(name, folder, undisturbed, seed):
+    """Kills a command at a moment, by a signal or in a write, and lets it run again."""
+    words, patterns = LONG[name]
+    expected, seconds = undisturbed(name)
+    chance = random.Random(f"{name} {seed}")
+    kind = chance.choice(["KILL", "TERM", "INT", "before", "after"])
+    if kind in ("before", "after"):
+        process = started(folder, words, IN_A_WRITE, str(chance.randint(1, 6)), kind)
+        process.wait(600)
+    else:
+        process = started(folder, words)
+        time.sleep(chance.uniform(0.3, 1.0) * seconds)
+        process.send_signal(getattr(signal, f"SIG{kind}"))
+        process.wait(600)
+    if kind in ("TERM", "INT"):
+        # It had the time to tidy up.
+        left = {p.name for p in folder.iterdir()} - {".out.npz.unfinished", ".out.obj.unfinished"}
+        assert left <= {*expected, ".out.pc2.unfinished"}, (kind, left)
+    assert started(folder, words).wait(600) == 0
+    assert results(folder, patterns) == expected, (kind, process.returncode)
+    assert {p.name for p in folder.iterdir()} == set(expected), "something was left lying"
+    return process.returncode
+
+
+@pytest.mark.release
+def test_a_command_killed_once_gives_the_same_bytes(undisturbed, tmp_path):
+    assert killed("dress", tmp_path / "0", undisturbed, 0) != 0, "it was killed in time"
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("name", LONG)
+def test_commands_killed_anywhere_give_the_same_bytes(name, undisturbed, tmp_path, promise):
+    ended = [killed(name, tmp_path / str(k), undisturbed, k) for k in range(8)]
+    in_time = sum(code != 0 for code in ended)
+    promise("killed anywhere, the same bytes", name, in_time, "kills in time", tries=len(ended))
+    assert in_time >= len(ended) // 2

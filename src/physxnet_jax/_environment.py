@@ -1,10 +1,14 @@
 """Checks of the installed jaxlib, cache folders and JAX's compilation cache."""
 
+import contextlib
+import ctypes
+import gc
 import hashlib
 import importlib.metadata
 import os
 import pathlib
 import platform
+import sys
 from collections.abc import MutableMapping, Sequence
 
 from .errors import BrokenInstallError
@@ -115,6 +119,23 @@ def clear_caches_if_full(share: float = 0.6) -> bool:
 
     jax.clear_caches()
     return True
+
+
+def release_programs() -> None:
+    """Gives up the memory of compiled programs, if this process is a `physxnet` command.
+
+    Programs that prepared garments are needed once, and hold hundreds of megabytes. One that is
+    needed again is loaded from the compilation cache.
+    """
+    if not is_command(sys.argv):
+        return
+    import jax
+
+    jax.clear_caches()
+    gc.collect()
+    # The allocator of glibc keeps what was freed.
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def processor_name() -> str:

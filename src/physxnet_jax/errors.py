@@ -57,6 +57,10 @@ class DiskFullError(PhysXNetError, OSError):
     """A file doesn't fit on its disk; the message gives the file, its size and what is free."""
 
 
+class OutOfMemoryError(PhysXNetError, MemoryError):
+    """Memory ended; the message states for what, and what to change."""
+
+
 class BusyError(PhysXNetError, RuntimeError):
     """Another process writes to a folder; the message names it and its machine."""
 
@@ -114,6 +118,7 @@ __all__ = [
     "MeshError",
     "MissingDependencyError",
     "MotionError",
+    "OutOfMemoryError",
     "PhysXNetError",
     "SimulationError",
     "WeightsError",

@@ -320,7 +320,7 @@ def read_arrays(
     path: str | pathlib.Path | bytes,
     names: Sequence[str] | None = None,
     *,
-    limit: int = 2_000_000_000,
+    limit: int | None = None,
 ) -> dict[str, np.ndarray]:
     """Reads arrays of an `.npz` by name; skips names that aren't in it.
 
@@ -330,7 +330,8 @@ def read_arrays(
     Args:
         path: The archive, or its content.
         names: Arrays to read; all if omitted.
-        limit: Maximum total size of the arrays, uncompressed [bytes].
+        limit: Maximum total size of the arrays, uncompressed [bytes]; by default 25 times the
+            archive's size, but at least 150 MB and at most 2 GB.
 
     Raises:
         ValueError: The file isn't an `.npz` archive, an array holds Python objects, a
@@ -340,9 +341,13 @@ def read_arrays(
     out: dict[str, np.ndarray] = {}
     total = 0
     # Once the file opens, any later OSError means invalid offsets in the archive.
-    if not isinstance(path, bytes):
-        with pathlib.Path(path).open("rb"):
-            pass
+    if isinstance(path, bytes):
+        size = len(path)
+    else:
+        with pathlib.Path(path).open("rb") as opened:
+            size = opened.seek(0, os.SEEK_END)
+    if limit is None:
+        limit = min(2_000_000_000, max(150_000_000, 25 * size))
     try:
         file = io.BytesIO(path) if isinstance(path, bytes) else path
         with zipfile.ZipFile(file) as archive:
@@ -353,7 +358,9 @@ def read_arrays(
                 info = members[name]
                 total += info.file_size
                 if total > limit:
-                    raise ValueError(f"over {limit / 1e9:.1f} GB of data")
+                    raise ValueError(
+                        f"over {limit / 1e6:.0f} MB of data in an archive of {size / 1e6:.1f} MB"
+                    )
                 with archive.open(info) as member:
                     _check_header(member, name, info.file_size)
                 with archive.open(info) as member:

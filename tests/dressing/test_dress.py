@@ -26,7 +26,7 @@ def test_lbs_is_linear_blend_skinning(body, rest):
 @pytest.mark.release
 def test_network_cloth_differs_from_skinning_and_stays_near_the_body():
     # Weights that learned these fitted garments.
-    fitted = Inference(weights="small")
+    fitted = Inference(weights="paper")
     a = dress("walk", ["bottom", "dress"], method="network", inference=fitted, frames=20)
     b = dress("walk", ["bottom", "dress"], method="lbs", frames=20)
     for x, y in zip(a.garments, b.garments):

@@ -242,7 +242,7 @@ def test_off_chart_vertices_are_bound_and_counted(motion):
 
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
-    predictor = load_predictor("small")
+    predictor = load_predictor("paper")
     valid = predictor.texel_points.valid["bottom"]
     garment = template("bottom")
     x = np.asarray(garment.mesh.vertices)
@@ -259,7 +259,7 @@ def test_off_chart_vertices_are_bound_and_counted(motion):
         Motion(*motion, 30.0),
         [long],
         method="network",
-        inference=Inference(weights="small", strain_iterations=0),
+        inference=Inference(weights="paper", strain_iterations=0),
         include_body=False,
     ).garments[0]
     still = dress(Motion(*motion, 30.0), [long], method="lbs", include_body=False).garments[0]

@@ -1,9 +1,13 @@
 """The page that plays a clip: whole by itself, and in a browser where there is one."""
 
+import base64
+import hashlib
+import http.server
 import json
 import pathlib
 import re
 import runpy
+import threading
 import time
 
 import numpy as np
@@ -40,6 +44,54 @@ def test_html_page_is_self_contained_and_escaped(page):
     outside = re.sub(r"<script.*?</script>", "", text, flags=re.S)
     assert not re.search(r"(src|href)=.https?:", outside)
     assert "__" not in outside
+
+
+POLICY = re.compile(r'<meta http-equiv="Content-Security-Policy" content="([^"]*)">\n')
+
+
+def test_the_policy_names_the_scripts_of_the_page_alone(page):
+    text = page.read_text(encoding="utf-8")
+    policy = POLICY.search(text)[1]
+    allowed = policy.partition("script-src ")[2].split()
+    scripts = re.findall(r'<script type="module">(.*?)</script>', text, flags=re.S)
+    digests = [base64.b64encode(hashlib.sha256(s.encode()).digest()).decode() for s in scripts]
+    assert allowed == [f"'sha256-{d}'" for d in digests] and len(allowed) == 2
+    assert policy.startswith("default-src 'none'") and "http" not in policy
+    # Handlers in attributes would not run.
+    assert not re.search(r"<[^>]* on\w+=", re.sub(r"<script.*?</script>", "", text, flags=re.S))
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(_BROWSER["BROWSER"] is None, reason="no Chromium installed")
+def test_foreign_scripts_and_requests_are_stopped(page, tmp_path):
+    asked = []
+
+    class Seen(http.server.BaseHTTPRequestHandler):
+        def do_GET(self):
+            asked.append(self.path)
+            self.send_error(404)
+
+        def log_message(self, *_):
+            pass
+
+    text = page.read_text(encoding="utf-8")
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Seen) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        at = f"http://127.0.0.1:{server.server_port}"
+        added = "<script>document.body.dataset.intruder = 'ran'</script>"
+        tab = _BROWSER["Page"]("about:blank", tmp_path / "profile", (480, 360))
+        ran = {}
+        try:
+            for name, whole in (("held", text), ("open", POLICY.sub("", text))):
+                foreign = f"{added}<img src='{at}/{name}'></body>"
+                (tmp_path / f"{name}.html").write_text(whole.replace("</body>", foreign))
+                tab.call("Page.navigate", url=(tmp_path / f"{name}.html").as_uri())
+                tab.until("document.body && document.body.dataset.state === 'loaded'")
+                ran[name] = tab.run("document.body.dataset.intruder || null")
+        finally:
+            tab.close()
+            server.shutdown()
+    assert ran == {"held": None, "open": "ran"} and asked == ["/open"]
 
 
 @pytest.mark.browser

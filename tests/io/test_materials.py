@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
-from physxnet_jax import fit_garment, template
+from physxnet_jax import dress, fit_garment, template
 from physxnet_jax.garment import load_garment
 from physxnet_jax.io import AnimatedMesh, read_mesh, read_obj, write_clip, write_obj
 
@@ -195,6 +195,17 @@ def test_invalid_or_outside_material_files_give_no_colour(quilted):
     quilted.write_text(text.replace("cloth.mtl", "../secret.mtl"))
     p = read_obj(quilted).polygons
     assert p is not None and p.materials[1].colour is None
+
+
+def test_a_lost_image_is_a_note(quilted, tmp_path):
+    materials = tmp_path / "cloth.mtl"
+    known = dress("walk", [quilted], method="lbs", frames=1)
+    materials.write_text(materials.read_text() + "map_Kd lost.png\n")
+    clip = dress("walk", [quilted], method="lbs", frames=1)
+    new = set(clip.notes) - set(known.notes)
+    assert len(new) == 1 and "colours are shown without lost.png" in new.pop()
+    for suffix in ("obj", "glb", "usdc"):
+        assert write_clip(tmp_path / f"a.{suffix}", clip.meshes, 30.0)
 
 
 def test_faces_without_a_material_stay_without_one(quilted, tmp_path):

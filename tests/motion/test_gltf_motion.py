@@ -201,7 +201,7 @@ def test_skeleton_is_taken_from_the_largest_skin(body, rest, tmp_path):
 def test_skeleton_with_collinear_hips_and_shoulders_is_refused(tmp_path):
     """Found by a fuzzer: a figure that lies, one hip above the other,
     in line with the shoulders."""
-    document = json.loads(runpy.run_path(str(TESTS / "test_fuzz.py"))["_gltf"](tmp_path))
+    document = json.loads(runpy.run_path(str(TESTS / "fuzz/readers.py"))["_gltf"](tmp_path))
     path = tmp_path / "a.gltf"
     path.write_text(json.dumps(document))
     load_motion(path)

@@ -128,7 +128,7 @@ def test_translation_changes_the_result_only_by_rounding():
 @pytest.mark.parametrize("effect", [Stretch(), Bend(), Gravity(), Damping(), Pin()])
 def test_absent_effects_are_not_in_the_program(effect):
     """Neither body nor effect is in the program of a scene that doesn't call for them."""
-    g = sheet(4)
+    g = sheet(4, pinned=np.arange(4))
     scene = prepare_scene(Scene((g,), (effect,)))
     pose, root = still(1)
     x = jnp.asarray(scene.assembly.rest.astype(np.float32))[:, :, None]

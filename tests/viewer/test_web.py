@@ -196,10 +196,10 @@ def test_comparison_reports_distances_to_the_simulation():
 
 @pytest.mark.release
 def test_maps_display_velocity_and_acceleration():
-    shown = run_job(Choice("punch", ("top",), inference=Inference(weights="small"), frames=20))
+    shown = run_job(Choice("punch", ("top",), inference=Inference(weights="paper"), frames=20))
     maps = shown.maps(10)
     assert {"velocity", "acceleration", "top"} == set(maps)
-    still = run_job(Choice("balance", (), inference=Inference(weights="small"), frames=1)).maps(0)
+    still = run_job(Choice("balance", (), inference=Inference(weights="paper"), frames=1)).maps(0)
     grey = [np.abs(m["velocity"].astype(int) - 127).max() for m in (maps, still)]
     covered = (still["velocity"] != 255).any(axis=2)
     assert grey[0] > 100 and np.abs(still["velocity"][covered].astype(int) - 127).max() <= 1
@@ -267,6 +267,9 @@ def test_recorded_page_is_a_single_complete_file(tmp_path):
     record(path, SHORT)
     text = path.read_text(encoding="utf-8")
     assert "__VISER_EMBED_DATA__" in text and len(text) > 1e6
+    policy = re.search(r'<head><meta http-equiv="Content-Security-Policy" content="([^"]*)">', text)
+    assert policy is not None and "default-src 'none'" in policy[1]
+    assert not re.search(r"http|\*|'self'", policy[1])
     assert [p.name for p in tmp_path.iterdir()] == ["walk.html"]
 
 

@@ -1,5 +1,6 @@
 """`physxnet dress`, `simulate` and `demo`: load, dress, write, report."""
 
+import contextlib
 import dataclasses
 import pathlib
 import time
@@ -8,7 +9,8 @@ from typing import Any, Literal
 
 from rich.console import Console
 
-from ..body import NUM_BODY_VERTICES, load_body
+from .._environment import release_programs
+from ..body import load_body
 from ..dressing import (
     EXTERNAL_ENGINES,
     Character,
@@ -21,7 +23,8 @@ from ..dressing import (
     load_scene,
     write_dressed_character,
 )
-from ..errors import FormatError, PhysXNetError
+from ..errors import FormatError, OutOfMemoryError, PhysXNetError
+from ..frames import scratch_folder
 from ..io import check_output, write_clip
 from ..models import read_card
 from ..motion import Motion, load_motion
@@ -73,10 +76,11 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
     _check_files(output.out, pictures, command.picture, console)
     with progress_bars(console, lines=command.terminal.progress) as progress:
         selected = choose(command, progress)
+        resume = _unfinished(output)
         options: dict[str, Any] = {
             "method": command.method,
             "inference": command.inference.build(),
-            "simulation": command.simulation.build(),
+            "simulation": dataclasses.replace(command.simulation.build(), resume=resume),
         }
         options |= {} if selected is None else selected.profile.options
         job = _job(
@@ -101,8 +105,6 @@ def run_simulate(command: Simulate, console: Console) -> int:
     output = command.output
     pictures = [] if output.preview is None else [output.preview]
     _check_files(output.out, pictures, command.picture, console)
-    first = output.out or output.preview
-    resume_folder = None if first is None else first.with_name(f".{first.name}.unfinished")
     with progress_bars(console, lines=command.terminal.progress) as progress:
         if is_scene_file(command.scene):
             job = _scene_job(command)
@@ -111,7 +113,7 @@ def run_simulate(command: Simulate, console: Console) -> int:
             job = _job(
                 command.scene, command.source, command.outfit, command.person, options, progress
             )
-        simulation = dataclasses.replace(job.simulation, resume=resume_folder)
+        simulation = dataclasses.replace(job.simulation, resume=_unfinished(output))
         job = dataclasses.replace(job, simulation=simulation)
         clip, written, seconds = _run(job, output, pictures, command.picture, progress)
     if command.terminal.json:
@@ -121,6 +123,12 @@ def run_simulate(command: Simulate, console: Console) -> int:
     console.print(rollout_table(clip, job.simulation, seconds))
     _print_end(clip, (*job.notes, *_lost(job, output)), written, console)
     return _code(output, clip)
+
+
+def _unfinished(output: Output) -> pathlib.Path | None:
+    """Folder of finished blocks, beside what they will become."""
+    first = output.out or output.preview
+    return None if first is None else first.with_name(f".{first.name}.unfinished")
 
 
 def _code(output: Output, clip: DressedClip) -> int:
@@ -250,35 +258,53 @@ def _run(
     look: PreviewOptions,
     progress: _Progress,
 ) -> tuple[DressedClip, list[pathlib.Path], float]:
+    out = output.out
+
+    def check_size(frames: int, vertices: dict[str, int]) -> None:
+        release_programs()
+        if out is not None:
+            # There the built-in body is a skeleton with a skin.
+            skinned = out.suffix.lower().startswith(".usd") and isinstance(job.motion, Motion)
+            written = sum(n for k, n in vertices.items() if not (skinned and k == "body"))
+            check_output(out, frames, written)
+
     motion = job.motion if isinstance(job.motion, Motion) else job.motion.motion
-    if output.out is not None:
-        frames = min(motion.num_frames, job.frames or motion.num_frames)
-        body = output.body and not output.out.suffix.lower().startswith(".usd")
-        check_output(output.out, frames, NUM_BODY_VERTICES if body else 0)
+    if out is not None:
+        # What is known before garments are loaded.
+        check_output(out, min(motion.num_frames, job.frames or motion.num_frames))
+
+    def report(stage: str, done: int, total: int) -> None:
+        if done == 0:
+            release_programs()
+        progress(stage, done, total)
+
     began = time.perf_counter()
-    clip = dress(
-        job.motion,
-        job.wear,
-        method=job.method,
-        inference=job.inference,
-        simulation=job.simulation,
-        fps=job.fps,
-        start=job.start,
-        frames=job.frames,
-        shape=job.shape,
-        include_body=output.body,
-        progress=progress,
-    )
+    first = out or (pictures[0] if pictures else None)
+    with contextlib.nullcontext() if first is None else scratch_folder(first.absolute().parent):
+        clip = dress(
+            job.motion,
+            job.wear,
+            method=job.method,
+            inference=job.inference,
+            simulation=job.simulation,
+            fps=job.fps,
+            start=job.start,
+            frames=job.frames,
+            shape=job.shape,
+            include_body=output.body,
+            progress=report,
+            on_size=check_size,
+        )
     seconds = time.perf_counter() - began
     written: list[pathlib.Path] = []
     files: list[Stage] = []
     ticks = time.perf_counter()
-    if output.out is not None:
+    if out is not None:
         person = job.motion
         if isinstance(person, Character) and _keeps_rig(person, output):
-            written.append(write_dressed_character(output.out, person, clip.garments))
+            written.append(write_dressed_character(out, person, clip.garments))
         else:
-            written += write_clip(output.out, clip.meshes, clip.fps, velocities=output.velocities)
+            written += _write(out, clip, output.velocities)
         files.append(Stage("writing", 1e3 * (time.perf_counter() - ticks)))
     for picture in pictures:
         ticks = time.perf_counter()
@@ -286,6 +312,19 @@ def _run(
         written.append(render_preview(picture, clip.meshes, clip.fps, progress=progress, **options))
         files.append(Stage("preview", 1e3 * (time.perf_counter() - ticks)))
     return dataclasses.replace(clip, stages=(*job.stages, *clip.stages, *files)), written, seconds
+
+
+def _write(out: pathlib.Path, clip: DressedClip, velocities: bool) -> list[pathlib.Path]:
+    try:
+        return write_clip(out, clip.meshes, clip.fps, velocities=velocities)
+    except MemoryError as error:
+        # An archive is written by parts.
+        kept = out.with_name(f"{out.stem}.kept.npz")
+        write_clip(kept, clip.meshes, clip.fps)
+        raise OutOfMemoryError(
+            f"{out}: memory ended while it was written ({error}). The finished clip is kept as"
+            f" {kept}. Write .usdc, .pc2, .mdd or .npz, or fewer --frames."
+        ) from error
 
 
 def _keeps_rig(person: Character, output: Output) -> bool:

@@ -106,6 +106,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise
         errors.print(f"physxnet: {error}", style="red", markup=False)
         return 1 if isinstance(error, BrokenInstallError) else 2
+    except (MemoryError, RuntimeError) as error:
+        # JAX has no class for it.
+        if not isinstance(error, MemoryError) and "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        if _flag(command, "debug"):
+            raise
+        kept = " Finished parts are kept for the next run." if _resumes(command) else ""
+        first = (str(error) or type(error).__name__).splitlines()[0].rstrip(".")
+        errors.print(
+            f"physxnet: memory ended: {first}.{kept} {_LESS_MEMORY}",
+            style="red",
+            markup=False,
+        )
+        return 2
     except KeyboardInterrupt as stop:
         left = "finished parts are kept for the next run" if _resumes(command) else ""
         PlainConsole(stderr=True).print(
@@ -114,6 +128,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 143 if isinstance(stop, _Terminated) else 130
 
 
+_LESS_MEMORY = (
+    "Take fewer --frames at a time (--start), fewer or coarser garments, or a smaller batch."
+)
 # Options that name what is written.
 _WRITTEN = ("out", "preview", "html", "write_scene", "errors", "contact_sheet")
 
@@ -172,7 +189,7 @@ def _flag(command: Any, name: str) -> bool:
 
 def _resumes(command: object) -> bool:
     """Whether an interrupted command resumes on its next run."""
-    if isinstance(command, Simulate):
+    if isinstance(command, Dress | Simulate):
         internal = command.simulation.engine in ("xpbd", "bdf2")
         return internal and (command.output.out or command.output.preview) is not None
     if isinstance(command, Evaluate | Bench):

@@ -1,6 +1,8 @@
 """Inference and penetration statistics over clips, in blocks of a fixed size."""
 
 import dataclasses
+import math
+import pathlib
 import time
 from collections.abc import Iterator, Sequence
 
@@ -12,6 +14,7 @@ from jaxtyping import Array, Float
 from ..body import Body
 from ..geometry import map_frames
 from ..motion import BLOCK, Motion, clip_transforms, history_transforms, padded_block
+from ..simulation import Resume, fingerprint
 from ._dresser import Dresser
 from ._guided import init_guided
 from ._pipeline import infer_block
@@ -64,7 +67,8 @@ class Block:
         raw: Each garment by name before collision resolution [m], shape
             [frames, vertices, 3].
         positions: Each garment by name [m], shape [frames, vertices, 3].
-        milliseconds: Time of the whole block, transfers included [ms].
+        milliseconds: Time of the whole block, transfers included [ms]; NaN if an earlier run
+            computed it.
     """
 
     start: int
@@ -80,12 +84,16 @@ class Block:
         return dataclasses.replace(self, raw=raw, positions=positions)
 
 
-def infer_clip(dresser: Dresser, clip: PosedClip) -> Iterator[Block]:
+def infer_clip(
+    dresser: Dresser, clip: PosedClip, resume: str | pathlib.Path | None = None
+) -> Iterator[Block]:
     """Runs a dresser over a clip, one block at a time.
 
     Args:
         dresser: From `make_dresser`.
         clip: From `pose_clip`, on the dresser's body.
+        resume: Folder for finished blocks, from which the same call goes on after an interruption;
+            it is removed at the end. Blocks of another call are removed.
 
     Yields:
         Blocks of at most `BLOCK` frames, in order.
@@ -102,7 +110,14 @@ def infer_clip(dresser: Dresser, clip: PosedClip) -> Iterator[Block]:
         state = init_guided(
             dresser.guided, jnp.asarray(r[history - 1]), jnp.asarray(t[history - 1])
         )
-    for start in range(0, clip.num_frames, BLOCK):
+    store, done = None, 0
+    if resume is not None:
+        store = Resume(resume, fingerprint(dresser, r, t, clip.motion.fps), keep=False)
+        for reached, arrays in store.blocks(state):
+            state = reached
+            yield _stored_block(BLOCK * done, names, arrays)
+            done += 1
+    for start in range(BLOCK * done, clip.num_frames, BLOCK):
         start_time = time.perf_counter()
         padded = (jnp.asarray(padded_block(x, start + history, history)) for x in (r, t))
         *out, state = infer_block(dresser, *padded, clip.motion.fps, state)
@@ -111,18 +126,39 @@ def infer_clip(dresser: Dresser, clip: PosedClip) -> Iterator[Block]:
             {n: np.asarray(x)[:count] for n, x in zip(names, part, strict=True)} for part in out
         )
         elapsed = 1e3 * (time.perf_counter() - start_time)
+        if store is not None:
+            arrays = {f"raw_{n}": x for n, x in raw.items()}
+            arrays |= {f"cloth_{n}": x for n, x in cloth.items()}
+            store.save(start // BLOCK, state, arrays)
         yield Block(start=start, raw=raw, positions=cloth, milliseconds=elapsed)
+    if store is not None:
+        store.finish()
+
+
+def _stored_block(start: int, names: list[str], arrays: dict[str, np.ndarray]) -> Block:
+    raw, cloth = ({n: arrays[f"{k}_{n}"] for n in names} for k in ("raw", "cloth"))
+    return Block(start=start, raw=raw, positions=cloth, milliseconds=math.nan)
 
 
 def inside_shares(
-    collider: BodyCollider, positions: Float[np.ndarray, "frames vertices 3"], clip: PosedClip
+    collider: BodyCollider,
+    positions: Float[np.ndarray, "frames vertices 3"],
+    clip: PosedClip,
+    start: int = 0,
 ) -> Float[np.ndarray, " frames"]:
-    """Computes the share of a garment's vertices below the nearby skin, for each frame."""
+    """Computes the share of a garment's vertices below the nearby skin, for each frame.
+
+    Args:
+        collider: The skin near the garment.
+        positions: The garment [m].
+        clip: The motion.
+        start: Frame of the clip at which the positions start.
+    """
     shares = []
-    for start in range(0, len(positions), BLOCK):
-        values = (positions, clip.rotations, clip.translations)
-        height = _heights(collider, *(padded_block(x, start, 0) for x in values))
-        shares.append(np.asarray(height < 0)[: len(positions) - start].mean(axis=1))
+    for at in range(0, len(positions), BLOCK):
+        pose = (padded_block(x, start + at, 0) for x in (clip.rotations, clip.translations))
+        height = _heights(collider, padded_block(positions, at, 0), *pose)
+        shares.append(np.asarray(height < 0)[: len(positions) - at].mean(axis=1))
     return np.concatenate(shares)
 
 

@@ -1,8 +1,11 @@
 """Dresses a motion in garments and returns animated meshes."""
 
 import concurrent.futures
+import contextlib
 import dataclasses
+import math
 import pathlib
+import time
 from collections.abc import Callable
 from typing import Any, Literal
 
@@ -10,9 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._environment import clear_caches_if_full
-from ..body import Body, load_body
+from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..devices import on_processor
 from ..errors import PhysXNetError
+from ..files import claim
+from ..frames import FrameStore, in_chunks, moved_frames
 from ..garment import Garment
 from ..io import AnimatedMesh
 from ..models import BoundGarment, Predictor, load_predictor
@@ -34,7 +39,13 @@ from .postprocess import BodyCollider, make_colliders
 
 Method = Literal["network", "guided", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "guided", "lbs", "simulate")
-INFERENCE_STAGES = ("skinning", "network", "guided simulation")
+_STAGES: dict[Method, str] = {
+    "lbs": "skinning",
+    "network": "network",
+    "guided": "guided simulation",
+    "simulate": "simulation",
+}
+INFERENCE_STAGES = tuple(name for method, name in _STAGES.items() if method != "simulate")
 """Names of the stages in which cloth is inferred."""
 Progress = Callable[[str, int, int], None]
 # A character's lowest point within this of 0 stands on the floor at 0 [m].
@@ -110,6 +121,7 @@ def dress(
     include_body: bool = True,
     progress: Progress | None = None,
     on_block: Callable[[Block], None] | None = None,
+    on_size: Callable[[int, dict[str, int]], None] | None = None,
 ) -> DressedClip:
     """Dresses a moving person.
 
@@ -131,12 +143,16 @@ def dress(
         include_body: Whether the result contains the body's mesh.
         progress: Called with the stage, the frames done and the total number of frames.
         on_block: Called with each finished block of all methods but ``simulate``.
+        on_size: Called with the number of frames and each mesh's number of vertices before the
+            cloth is computed; what it raises ends the call.
 
     Returns:
-        Animated meshes, with the time of each stage.
+        Animated meshes, with the time of each stage. Positions of more than 64 MB are kept in a
+        nameless file among temporary files ($TMPDIR), read as they are used, and can't be written.
 
     Raises:
         PhysXNetError: An input can't be read, bound or worn; the message states the reason.
+        DiskFullError: The clip fits neither in memory nor on the disk, see `FrameStore`.
 
     Example:
         >>> clip = dress("walk", ["bottom"], method="lbs", frames=2)
@@ -150,19 +166,28 @@ def dress(
     clear_caches_if_full()
     person = _load_person(motion, body, shape, fps, start, frames, stages)
     garments, notes = _load_garments(wear, person, method, stages)
+    if on_size is not None:
+        sizes = {"body": person.num_vertices} if include_body else {}
+        on_size(person.clip.num_frames, sizes | {g.name: g.num_vertices for g in garments})
     if method in ("guided", "simulate"):
         where = garments, person.body, person.shape, person.clip.motion, person.floor
         simulation = with_floor(simulation, *where)
     dresser = _make_dresser(garments, person, method, inference, simulation, stages)
+    if progress is not None:
+        progress(_STAGES[method], 0, person.clip.num_frames)
     with concurrent.futures.ThreadPoolExecutor(1) as pool:
         # Compiled while the cloth's own program is.
         colliders = pool.submit(_colliders, dresser, person)
         if method == "simulate":
             cloth = _simulate_cloth(garments, person, simulation, stages, progress)
         else:
-            cloth = _infer_cloth(dresser, person, stages, progress, on_block)
-        measured = colliders.result()
-    return _assemble_clip(dresser, person, cloth, measured, method, include_body, notes, stages)
+            resume = simulation.resume
+            cloth = _infer_cloth(
+                dresser, person, method, stages, progress, on_block, resume, colliders
+            )
+        if not cloth.inside:
+            cloth = _measured(cloth, dresser, person, colliders.result())
+    return _assemble_clip(dresser, person, cloth, method, include_body, notes, stages)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -180,6 +205,13 @@ class _Person:
     place: Float[np.ndarray, "3"]
 
     @property
+    def num_vertices(self) -> int:
+        """Number of vertices that are written of the person."""
+        if self.character is None:
+            return NUM_BODY_VERTICES
+        return self.character.mesh.positions.shape[1]
+
+    @property
     def floor(self) -> float:
         """Height of the floor [m]: that of a character's lowest point, if it isn't near 0."""
         if self.character is None:
@@ -190,10 +222,15 @@ class _Person:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Cloth:
-    """Garments by name, before and after collision resolution [m]."""
+    """Garments by name [m], and for each the share inside the body in every frame.
 
-    raw: dict[str, np.ndarray]
+    The shares before collision resolution come first; there are none for a character. A rollout has
+    the same garments in the same order.
+    """
+
     positions: dict[str, np.ndarray]
+    inside: dict[str, tuple[np.ndarray, np.ndarray]] = dataclasses.field(default_factory=dict)
+    milliseconds: float = 0.0
     rollout: Rollout | None = None
     effects: tuple[str, ...] = ()
 
@@ -279,37 +316,55 @@ def _simulate_cloth(
     rollout = run_simulation(
         scene, person.clip.motion, simulation, progress=progress, stages=stages
     )
-    named = dict(zip([g.name for g in scene.garments], rollout.positions, strict=True))
-    cloth = {g.name: named[g.name] for g in garments}
+    cloth = dict(zip([g.name for g in scene.garments], rollout.positions, strict=True))
     own = simulation.engine not in EXTERNAL_ENGINES
     effects = tuple(type(e).__name__ for e in scene.effects) if own else ()
-    return _Cloth(raw=cloth, positions=cloth, rollout=rollout, effects=effects)
+    return _Cloth(positions=cloth, rollout=rollout, effects=effects)
 
 
 def _infer_cloth(
     dresser: Dresser,
     person: _Person,
+    method: Method,
     stages: list[Stage],
     progress: Progress | None,
     on_block: Callable[[Block], None] | None,
+    resume: pathlib.Path | None,
+    colliders: "concurrent.futures.Future[tuple[BodyCollider, ...]]",
 ) -> _Cloth:
     clip = person.clip
-    # A dresser that simulates has a network too.
-    name = INFERENCE_STAGES[(dresser.predictor is not None) + (dresser.guided is not None)]
-    blocks: list[Block] = []
-    for block in infer_clip(dresser, clip):
-        blocks.append(block)
-        if on_block is not None:
-            on_block(block.moved(person.place))
-        if progress is not None:
-            progress(name, min(block.start + BLOCK, clip.num_frames), clip.num_frames)
-    times = [b.milliseconds for b in blocks]
-    warm = float(np.median(times[1:])) / BLOCK if len(times) > 1 else None
-    stages.append(Stage(name, times[0], warm))
     names = [w.name for w in dresser.worn]
+    stores = {n: FrameStore(clip.num_frames) for n in names}
+    inside: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {n: [] for n in names}
+    measuring = 0.0
+    name = _STAGES[method]
+    times: list[float] = []
+    with contextlib.nullcontext() if resume is None else claim(resume):
+        for block in infer_clip(dresser, clip, resume):
+            times += [] if math.isnan(block.milliseconds) else [block.milliseconds]
+            for n, x in block.positions.items():
+                stores[n].append(x)
+            if on_block is not None:
+                on_block(block.moved(person.place))
+            if progress is not None:
+                progress(name, min(block.start + BLOCK, clip.num_frames), clip.num_frames)
+            begun = time.perf_counter()
+            for n, c in zip(names, colliders.result(), strict=False):
+                after = before = inside_shares(c, block.positions[n], clip, block.start)
+                if dresser.colliders is not None:
+                    before = inside_shares(c, block.raw[n], clip, block.start)
+                inside[n].append((before, after))
+            measuring += 1e3 * (time.perf_counter() - begun)
+    warm = float(np.median(times[1:])) / BLOCK if len(times) > 1 else None
+    stages.append(Stage(name, times[0] if times else 0.0, warm))
     return _Cloth(
-        raw={n: np.concatenate([b.raw[n] for b in blocks]) for n in names},
-        positions={n: np.concatenate([b.positions[n] for b in blocks]) for n in names},
+        positions={n: s.array() for n, s in stores.items()},
+        inside={
+            n: (np.concatenate([x for x, _ in found]), np.concatenate([x for _, x in found]))
+            for n, found in inside.items()
+            if found
+        },
+        milliseconds=measuring,
     )
 
 
@@ -326,44 +381,65 @@ def _colliders(dresser: Dresser, person: _Person) -> tuple[BodyCollider, ...]:
     return tuple(colliders)
 
 
+def _measured(
+    cloth: _Cloth, dresser: Dresser, person: _Person, colliders: tuple[BodyCollider, ...]
+) -> _Cloth:
+    """Simulated cloth with its shares inside the body; a character is measured differently."""
+    begun = time.perf_counter()
+    inside = {}
+    for w, c in zip(dresser.worn, colliders, strict=False):
+        shares: list[np.ndarray] = []
+        start = 0
+        for x in in_chunks(cloth.positions[w.name]):
+            shares.append(inside_shares(c, x, person.clip, start))
+            start += len(x)
+        inside[w.name] = (np.concatenate(shares),) * 2
+    elapsed = 1e3 * (time.perf_counter() - begun)
+    return dataclasses.replace(cloth, inside=inside, milliseconds=elapsed)
+
+
 def _assemble_clip(
     dresser: Dresser,
     person: _Person,
     cloth: _Cloth,
-    colliders: tuple[BodyCollider, ...],
     method: Method,
     include_body: bool,
     notes: tuple[str, ...],
     stages: list[Stage],
 ) -> DressedClip:
-    """Assembles the result and measures the share of each garment inside the body."""
-    character, clip = person.character, person.clip
-    positions, worst = cloth.positions, {}
-    with timed(stages, "body"):
-        if character is not None:
-            raw, positions = dress_character(character, dresser, clip, positions)
-            inside_raw, inside = (
-                {n: character_penetration(character, x) for n, x in part.items()}
-                for part in (raw, positions)
-            )
-        else:
-            inside_raw, inside = {}, {}
-            for w, c in zip(dresser.worn, colliders, strict=True):
-                shares = inside_shares(c, positions[w.name], clip)
-                inside[w.name] = inside_raw[w.name] = float(shares.mean())
-                worst[w.name] = (int(shares.argmax()), float(shares.max()))
-                if cloth.raw is not cloth.positions and dresser.colliders is not None:
-                    inside_raw[w.name] = float(inside_shares(c, cloth.raw[w.name], clip).mean())
-        meshes = animated_meshes(
-            person.body, clip.motion, person.shape, dresser.garments, positions, include_body
+    """Assembles the result, at the person's place."""
+    character, clip, rollout = person.character, person.clip, cloth.rollout
+    worst = {}
+    begun = time.perf_counter()
+    if character is not None:
+        raw, positions = dress_character(character, dresser, clip, cloth.positions)
+        inside_raw, inside = (
+            {n: character_penetration(character, x) for n, x in part.items()}
+            for part in (raw, positions)
         )
-        if character is not None and include_body:
-            moving = character.mesh.positions[: clip.num_frames]
-            meshes = (dataclasses.replace(character.mesh, positions=moving), *meshes[1:])
+    else:
+        inside_raw, inside = (
+            {n: float(shares[k].mean()) for n, shares in cloth.inside.items()} for k in (0, 1)
+        )
+        for n, (_, shares) in cloth.inside.items():
+            worst[n] = (int(shares.argmax()), float(shares.max()))
+        positions = {n: moved_frames(x, person.place) for n, x in cloth.positions.items()}
+        if rollout is not None:
+            rollout = dataclasses.replace(rollout, positions=tuple(positions.values()))
+    meshes = animated_meshes(
+        person.body, clip.motion, person.shape, dresser.garments, positions, include_body
+    )
+    if include_body:
+        meshes = (meshes[0].moved(person.place), *meshes[1:])
+    if character is not None and include_body:
+        moving = character.mesh.positions[: clip.num_frames]
+        meshes = (dataclasses.replace(character.mesh, positions=moving), *meshes[1:])
+    elapsed = 1e3 * (time.perf_counter() - begun)
+    stages.append(Stage("body", cloth.milliseconds + elapsed))
     fault = sudden_turns(person.body, clip.motion)
     bound = {w.name: w.binding if isinstance(w, BoundGarment) else None for w in dresser.worn}
     return DressedClip(
-        meshes=tuple(m.moved(person.place) for m in meshes),
+        meshes=meshes,
         fps=clip.motion.fps,
         stages=tuple(stages),
         hit_rate={n: None if b is None else float(b.hit_rate) for n, b in bound.items()},
@@ -378,7 +454,7 @@ def _assemble_clip(
             *notes,
         ),
         worst=worst,
-        rollout=cloth.rollout and cloth.rollout.moved(person.place),
+        rollout=rollout,
         effects=cloth.effects,
     )
 

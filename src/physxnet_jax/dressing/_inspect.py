@@ -351,7 +351,7 @@ def _report_parts(found: _Findings, path: pathlib.Path, raw: StaticMesh, body: B
 def _report_images(found: _Findings, raw: StaticMesh) -> None:
     looks = () if raw.polygons is None else raw.polygons.materials
     images = [m.texture for m in looks if m.texture is not None]
-    lost = sorted({t.name for t in images if t.data is None})
+    lost = () if raw.polygons is None else raw.polygons.lost_images
     if lost:
         found.notes.append(
             f"images that can't be used: {', '.join(lost)[:200]}. Only PNG and JPEG in the file's"

@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import re
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,10 @@ from jaxtyping import Array, Float
 
 from ..body import NUM_BODY_VERTICES, Body
 from ..errors import PhysXNetError
+from ..frames import FrameStore
 from ..garment import Garment, load_outfit
 from ..io import AnimatedMesh, Skinning
-from ..motion import Motion, body_animation, clip_transforms
+from ..motion import Motion, body_blocks, clip_transforms
 
 Wear = Sequence[Garment | str | pathlib.Path] | Garment | str | pathlib.Path
 """One or several garments, garment files, kinds of the tailor or templates.
@@ -54,7 +55,7 @@ def animated_meshes(
         meshes.append(
             AnimatedMesh(
                 "body",
-                np.asarray(body_animation(body, clip, shape)),
+                _all_frames(clip.num_frames, body_blocks(body, clip, shape)),
                 np.asarray(mesh.faces),
                 np.asarray(mesh.uv),
                 np.asarray(mesh.uv_faces),
@@ -72,6 +73,13 @@ def animated_meshes(
             AnimatedMesh(g.name, positions[g.name], faces, uv, uv_faces, colour, g.polygons)
         )
     return tuple(meshes)
+
+
+def _all_frames(frames: int, blocks: Iterable[np.ndarray]) -> np.ndarray:
+    store = FrameStore(frames)
+    for block in blocks:
+        store.append(block)
+    return store.array()
 
 
 def _skinning(body: Body, clip: Motion, shape: Any | None) -> Skinning:
@@ -123,6 +131,9 @@ def resolve_garments(
             found = load_outfit(word, body=body, shape=shape)
             loaded = [garment for garment, _ in found]
             notes += [report.warning for _, report in found if report.warning is not None]
+            lost = [n for g in loaded if g.polygons for n in g.polygons.lost_images]
+            if lost:
+                notes.append(f"{word}: its colours are shown without {', '.join(lost)[:200]}.")
             if len(found) > 1:
                 names = ", ".join(f"{g.name} ({g.template})" for g in loaded)
                 notes.append(f"{word}: holds {len(found)} garments, worn in layers: {names}.")

@@ -63,7 +63,7 @@ class Simulation:
         refine: Longest edge of the garments while they are simulated [m]: coarse meshes then
             fold and lie on the body as fine ones do. The result is on their own vertices; errors
             and diagnostics are of the finer ones.
-        resume: Folder that keeps finished blocks until the simulation completes.
+        resume: Folder that keeps finished blocks of the clip until it is complete, for all methods.
     """
 
     accuracy: Accuracy = "standard"

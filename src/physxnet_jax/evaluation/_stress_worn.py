@@ -24,7 +24,7 @@ from ..simulation import (
     slipped,
     standard_effects,
 )
-from ..simulation.effects import BodyContact, Pin
+from ..simulation.effects import Air, BodyContact, Damping, Pin, StrainLimit
 from ._penetration import penetration
 from ._strain import edge_strain
 from ._stress import bad_frames, case
@@ -256,6 +256,22 @@ def closed_armpits_and_crossed_arms() -> Iterator[tuple[str, float, float]]:
     yield from _body_rows(out)
     yield "greatest speed (m/s)", 20.0, float(out.diagnostics["speed_max"].max())
     yield "pinching unnoticed (1 = yes)", 0, float(not (out.status & Status.PINCHED).any())
+
+
+@case
+def a_strain_limit_in_a_storm() -> Iterator[tuple[str, float, float]]:
+    """A dress in wind of 30 m/s, with and without a limit of 10 % on the strain of its edges."""
+    m = load_motion("walk", fps=_FPS)
+    m = dataclasses.replace(m, rotations=m.rotations[:24], root=m.root[:24])
+    garments = (template("dress"),)
+    storm = tuple(e for e in standard_effects(garments) if not isinstance(e, Damping))
+    storm = (Air(wind=(0.0, 0.0, 30.0)), *storm)
+    at = [type(e) for e in storm].index(BodyContact)
+    limited = (*storm[:at], StrainLimit(), *storm[at:])
+    free, held = (simulate_batch(Scene(garments, e), [m])[0] for e in (storm, limited))
+    most = [float(out.diagnostics["strain_p99"].max()) for out in (held, free)]
+    yield NOT_FINITE, 0, bad_frames(held)
+    yield "99 % of edges, most strain over that without a limit (1)", 1.0, most[0] / most[1]
 
 
 def one(name: Template) -> Callable[[], tuple[Garment, ...]]:

@@ -35,7 +35,7 @@ def align_to_template(
     x = np.asarray(wanted.mesh.vertices, np.float64)
     search = Search(mesh.vertices, mesh.faces, posed_bodies(body), region=x)
     turned = turns(hints.up or mesh.up, hints.front, every=True)
-    extent = np.ptp(mesh.vertices, axis=0)
+    extent = np.ptp(search.vertices, axis=0)
     units = plausible_units(float(extent.max()))
     found = choose(search, units, turned)
     if found is None or found.cost > _GOOD:

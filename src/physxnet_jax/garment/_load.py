@@ -28,6 +28,7 @@ from ._locate import Hints, Placement, locate_on_body, nearest_skin
 from ._made_on import placed_by_body
 from ._openings import Opening, openings
 from ._poses import posed_bodies
+from ._search import strays
 from ._templates import template
 from ._wear import WearItem, parse_wear, with_fabric
 from .tailoring import KINDS, tailor
@@ -321,7 +322,8 @@ def hangs_off(
 
     A garment that rests on shoulders or hips touches the skin there.
     """
-    height = np.asarray(vertices)[:, 1]
+    odd = strays(np.asarray(vertices))
+    height, distance = np.asarray(vertices)[~odd, 1], distance[~odd]
     return float(distance[height >= height.max() - _TOP_SHARE * np.ptp(height)].min())
 
 

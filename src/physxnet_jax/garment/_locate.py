@@ -23,7 +23,7 @@ from ..io import StaticMesh
 from ._garment import carried_weights
 from ._openings import Opening
 from ._poses import PosedBody, posed_bodies
-from ._search import FRAMES, UNITS, Candidate, Search, choose, plausible_units, turns
+from ._search import FRAMES, UNITS, Candidate, Search, choose, plausible_units, strays, turns
 
 # Cost above which a garment is refused if nothing holds it where its file has it [m].
 _MAX_COST = 0.09
@@ -101,7 +101,7 @@ def locate_on_body(
         MeshError: Nothing places the mesh on the body, or it is a flat sewing pattern.
     """
     search = Search(mesh.vertices, mesh.faces, posed_bodies(body))
-    size = float(np.ptp(mesh.vertices, axis=0).max())
+    size = float(np.ptp(search.vertices, axis=0).max())
     notes, found = [], None
     turned = turns(hints.up or mesh.up, hints.front)
     units = plausible_units(size) if hints.unit is None else _given(hints.unit, size)
@@ -123,7 +123,15 @@ def placement_of(
     search: Search, found: Candidate, mesh: StaticMesh, body: Body, notes: Sequence[str] = ()
 ) -> Placement:
     """The placement of a mesh on the body at rest, from its place on a posed body."""
-    v = found.apply(search.vertices)
+    v = found.apply(np.asarray(mesh.vertices, np.float64))
+    odd = strays(v)
+    if odd.any():
+        away = float(np.linalg.norm(v[odd] - np.median(v[~odd], axis=0), axis=1).max())
+        notes = (
+            *notes,
+            f"{odd.sum()} of its {len(v)} vertices lie as far as {away:.1f} m from it:"
+            " delete them.",
+        )
     if found.pose != "rest":
         v = _to_rest_pose(v, mesh.faces, body, search.poses[found.pose])
     return Placement(

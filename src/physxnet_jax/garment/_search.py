@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ..geometry import boundary_loops
 from ._openings import Opening, openings
@@ -43,6 +43,8 @@ _GOOD = 0.018
 # A garment that is held lies this near the skin [m], with that share of it; and is inside with
 # less than this share [1].
 _CONTACT, _HELD, _INSIDE = 0.03, 0.03, 0.05
+# Share of vertices on either side that may be strays.
+_ODD = 0.002
 _COARSE, _FINE, _GRID, _BEST = 160, 800, 0.05, 8
 _POSES = ("rest", "T-pose")
 
@@ -159,6 +161,25 @@ def surface_points(
     return np.einsum("nk,nkc->nc", rng.dirichlet(np.ones(3), count), corner[face])
 
 
+def strays(vertices: Float[np.ndarray, "vertices 3"]) -> Bool[np.ndarray, " vertices"]:
+    """Which vertices lie farther beyond almost all others than these extend.
+
+    A vertex left behind in another corner of a scene would be most of a garment's size.
+    """
+    low, high = np.quantile(vertices, [_ODD, 1.0 - _ODD], axis=0)
+    margin = float((high - low).max())
+    return ((vertices < low - margin) | (vertices > high + margin)).any(axis=1)
+
+
+def drawn_in(vertices: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "vertices 3"]:
+    """Vertices with strays moved to the box of all others."""
+    odd = strays(vertices)
+    if not odd.any() or odd.all():
+        return vertices
+    kept = vertices[~odd]
+    return np.clip(vertices, kept.min(axis=0), kept.max(axis=0))
+
+
 class Search:
     """The search for one mesh; candidates are made by `known` and `found`.
 
@@ -178,7 +199,7 @@ class Search:
         region: Float[np.ndarray, "others 3"] | None = None,
     ) -> None:
         self.region = None if region is None else (region.min(axis=0), region.max(axis=0))
-        self.vertices, self.poses = np.asarray(vertices, np.float64), poses
+        self.vertices, self.poses = drawn_in(np.asarray(vertices, np.float64)), poses
         self.coarse = surface_points(self.vertices, faces, _COARSE)
         self.fine = surface_points(self.vertices, faces, _FINE)
         self.loops = boundary_loops(faces)

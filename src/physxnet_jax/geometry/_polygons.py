@@ -103,6 +103,12 @@ class Polygons:
         return np.repeat(np.arange(len(self.counts)), self.counts - 2)
 
     @functools.cached_property
+    def lost_images(self) -> tuple[str, ...]:
+        """Names of images that the materials mention and that can't be used."""
+        images = [m.texture for m in self.materials if m.texture is not None]
+        return tuple(sorted({t.name for t in images if t.data is None}))
+
+    @functools.cached_property
     def starts(self) -> Int[np.ndarray, " polygons"]:
         """Position of the first corner of each polygon in ``corners``."""
         return np.cumsum(self.counts) - self.counts

@@ -7,6 +7,7 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int
 
+from ..frames import moved_frames
 from ..geometry import Material, Polygons, Texture
 
 
@@ -40,7 +41,9 @@ class AnimatedMesh:
             return self
         s = self.skinning
         skinning = s and dataclasses.replace(s, translations=s.translations + by)
-        return dataclasses.replace(self, positions=self.positions + by, skinning=skinning)
+        return dataclasses.replace(
+            self, positions=moved_frames(self.positions, by), skinning=skinning
+        )
 
     @property
     def looks(self) -> list["Look"]:

@@ -15,6 +15,9 @@ from ._animated_mesh import AnimatedMesh, smooth_normals
 
 MAX_FRAMES = 300
 """Largest number of frames: each is stored in full, and viewers hold all of them in memory."""
+MAX_BYTES = 400_000_000
+"""Largest size of positions and normals [bytes]."""
+_VERTEX_BYTES = 24
 
 
 def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
@@ -31,7 +34,7 @@ def write_gltf(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
         fps: Frames per second.
 
     Raises:
-        FormatError: There are more than `MAX_FRAMES` frames.
+        FormatError: There are more than `MAX_FRAMES` frames, or `MAX_BYTES` bytes.
         MissingDependencyError: pygltflib isn't installed.
 
     References:
@@ -52,7 +55,7 @@ def gltf_document(
 
 def _built(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> Any:
     frames = len(meshes[0].positions)
-    check_gltf(path, frames)
+    check_gltf(path, frames, sum(m.positions.shape[1] for m in meshes))
     import pygltflib
 
     file = _Builder(pygltflib)
@@ -62,13 +65,21 @@ def _built(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float)
     return file.document()
 
 
-def check_gltf(path: str | pathlib.Path, frames: int | None = None) -> None:
+def check_gltf(path: str | pathlib.Path, frames: int | None = None, vertices: int = 0) -> None:
     """Raises the errors of `write_gltf` before there is anything to write.
 
     Args:
         path: File name for the error message.
         frames: Number of frames, if known.
+        vertices: Number of vertices, as far as it is known.
     """
+    size = _VERTEX_BYTES * vertices * (frames or 0)
+    if size > MAX_BYTES:
+        raise FormatError(
+            f"{path}: {frames} frames of {vertices} vertices take {size / 1e6:.0f} MB, too much"
+            f" for glTF (at most {MAX_BYTES / 1e6:.0f}): write .usdc or .pc2, or fewer frames"
+            " (--frames)."
+        )
     if frames is not None and frames > MAX_FRAMES:
         raise FormatError(
             f"{path}: {frames} frames are too many for glTF (at most {MAX_FRAMES}): write"

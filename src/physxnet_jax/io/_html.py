@@ -1,6 +1,7 @@
 """A self-contained HTML page that plays a clip: a glTF and its viewer in one file."""
 
 import base64
+import hashlib
 import html
 import itertools
 import json
@@ -20,6 +21,7 @@ _PAGE = """<!DOCTYPE html>
 <html lang="en">
 <head>
 <meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="__POLICY__">
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>__TITLE__</title>
 <style>
@@ -38,7 +40,7 @@ button { min-width: 5em; }
  tone-mapping="neutral" exposure="0.85" camera-orbit="25deg 80deg __AWAY__m"
  camera-target="__MIDDLE__" field-of-view="30deg" max-camera-orbit="auto auto __FARTHEST__m"
  alt="__TITLE__"><div slot="progress-bar"></div></model-viewer>
-<form onsubmit="return false">
+<form>
 <button type="button" id="play">pause</button>
 <input type="range" id="time" min="0" max="__LAST__" value="0" step="1" aria-label="frame">
 <output id="shown"></output>
@@ -46,6 +48,7 @@ button { min-width: 5em; }
 </form>
 <script id="data" type="application/json">__DATA__</script>
 <script type="module">
+document.querySelector('form').addEventListener('submit', e => e.preventDefault());
 const data = JSON.parse(document.getElementById('data').textContent);
 const [view, play, time, shown, parts] =
   ['view', 'play', 'time', 'shown', 'parts'].map(id => document.getElementById(id));
@@ -108,11 +111,24 @@ follow();
 """
 
 
+# The last script of the page.
+_SCRIPT = _PAGE.rpartition('<script type="module">')[2].partition("</script>")[0]
+# Nothing is fetched from anywhere, and no other script runs than the page's own.
+_POLICY = (
+    "default-src 'none'; style-src 'unsafe-inline'; img-src blob: data:; connect-src blob: data:;"
+    " base-uri 'none'; form-action 'none'"
+)
+
+
+def _digest(script: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
+
+
 def write_html(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
     """Writes a self-contained HTML page that plays the clip in any browser.
 
-    The page needs no network. The mouse orbits the camera, playback can be paused and scrubbed,
-    and every mesh can be hidden. The address ``page.html#frame=12&without=top`` opens the page
+    The page needs no network, and its content policy allows none. The mouse orbits the camera,
+    playback can be paused and scrubbed, and every mesh can be hidden. The address ``page.html#frame=12&without=top`` opens the page
     at a frame, without a mesh. The limits of `write_gltf` apply.
 
     Args:
@@ -148,7 +164,8 @@ def write_html(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
         "__DATA__": json.dumps(contents).replace("<", "\\u003c"),
         "__VIEWER__": _VIEWER.read_text(encoding="utf-8").replace("</script", "<\\/script"),
     }
-    page = _PAGE
+    viewer, own = (_digest(text) for text in (parts["__VIEWER__"], _SCRIPT))
+    page = _PAGE.replace("__POLICY__", f"{_POLICY}; script-src {viewer} {own}")
     for name, text in parts.items():
         page = page.replace(name, text)
     with atomic_write(path) as part:

@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from ..errors import FormatError
 from ..files import atomic_write
+from ..frames import in_chunks
 
 _HEADER = struct.Struct(">ii")
 
@@ -24,7 +25,8 @@ def write_mdd(
     with atomic_write(path) as part, part.open("wb") as file:
         file.write(_HEADER.pack(frames, vertices))
         file.write((np.arange(frames) / fps).astype(">f4").tobytes())
-        file.write(np.ascontiguousarray(positions, dtype=">f4").tobytes())
+        for x in in_chunks(positions):
+            file.write(np.ascontiguousarray(x, dtype=">f4").data)
 
 
 def read_mdd(

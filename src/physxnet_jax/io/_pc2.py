@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from ..errors import FormatError
 from ..files import atomic_write
+from ..frames import in_chunks
 
 _HEADER = struct.Struct("<12siiffi")
 
@@ -17,7 +18,8 @@ def write_pc2(path: str | pathlib.Path, positions: Float[np.ndarray, "frames ver
     frames, vertices, _ = positions.shape
     with atomic_write(path) as part, part.open("wb") as file:
         file.write(_HEADER.pack(b"POINTCACHE2\0", 1, vertices, 0.0, 1.0, frames))
-        file.write(np.ascontiguousarray(positions, dtype="<f4").tobytes())
+        for x in in_chunks(positions):
+            file.write(np.ascontiguousarray(x, dtype="<f4").data)
 
 
 def read_pc2(path: str | pathlib.Path) -> Float[np.ndarray, "frames vertices 3"]:

@@ -1,6 +1,7 @@
 # pyright: reportAttributeAccessIssue=false
 """Writes USD: constant topology, time samples, metres, Y up."""
 
+import itertools
 import pathlib
 import re
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from ..errors import MissingDependencyError
 from ..files import atomic_write
+from ..frames import in_chunks
 from ..geometry import Texture
 from ._animated_mesh import AnimatedMesh, Look, Skinning, smooth_normals, vertex_velocities
 from ._texture import write_textures
@@ -107,15 +109,23 @@ def _write(
             normals.Set(vectors(smooth_normals(m.skinning.rest[None], m.faces)[0]))
             _bind_skeleton(stage, prim, m.skinning, name)
         else:
-            smooth = smooth_normals(m.positions, m.faces)
-            for k, x in enumerate(m.positions):
-                points.Set(vectors(x), k)
-                normals.Set(vectors(smooth[k]), k)
-            if velocities:
-                speed = prim.CreateVelocitiesAttr()
-                for k, v in enumerate(vertex_velocities(m.positions, fps)):
-                    speed.Set(vectors(v), k)
-        for k, x in enumerate(m.positions):
+            k, last = 0, m.positions[:0]
+            speed = prim.CreateVelocitiesAttr() if velocities else None
+            for chunk in in_chunks(m.positions):
+                if k:
+                    # What is saved leaves memory.
+                    stage.GetRootLayer().Save()
+                for j, (x, n) in enumerate(zip(chunk, smooth_normals(chunk, m.faces), strict=True)):
+                    points.Set(vectors(x), k + j)
+                    normals.Set(vectors(n), k + j)
+                if speed is not None:
+                    # The last frame's velocity follows from the one before.
+                    frames = np.concatenate([last, chunk])
+                    for j, v in enumerate(vertex_velocities(frames, fps)):
+                        speed.Set(vectors(v), k - len(last) + j)
+                    last = frames[-2:].copy()
+                k += len(chunk)
+        for k, x in enumerate(itertools.chain.from_iterable(in_chunks(m.positions))):
             extent.Set(vectors(np.stack([x.min(axis=0), x.max(axis=0)])), k)
         if m.uv is not None and m.uv_faces is not None:
             st = UsdGeom.PrimvarsAPI(prim).CreatePrimvar(

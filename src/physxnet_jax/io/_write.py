@@ -4,12 +4,14 @@ import contextlib
 import itertools
 import pathlib
 import re
+import zipfile
 from collections.abc import Sequence
 
 import numpy as np
 
 from ..errors import FormatError
 from ..files import atomic_write, check_writable
+from ..frames import in_chunks
 from ._animated_mesh import AnimatedMesh
 from ._gltf import check_gltf, write_gltf
 from ._html import write_html
@@ -21,6 +23,9 @@ from ._usd import check_usd, write_usd
 EXTENSIONS = (".usdc", ".usd", ".usda", ".pc2", ".mdd", ".glb", ".html", ".obj", ".npz")
 # Characters that file names may not contain on some system.
 _INVALID = re.compile(r'[\\/:*?"<>|\x00-\x1f]')
+MAX_USDA = 1_000_000_000
+"""Largest `.usda` in memory [bytes], where all of it is until it is written."""
+_USDA_BYTES = 24
 # What a vertex takes in a frame at least [bytes].
 _VERTEX_BYTES = {".obj": 20, ".npz": 9, ".pc2": 12, ".mdd": 12, ".glb": 12, ".html": 12}
 _VERTEX_BYTES |= {".usdc": 12, ".usd": 12, ".usda": 20}
@@ -53,7 +58,11 @@ def check_output(
     if path.suffix.lower().startswith(".usd"):
         check_usd()
     if path.suffix.lower() in (".glb", ".html"):
-        check_gltf(path, frames)
+        check_gltf(path, frames, vertices)
+    if path.suffix.lower() == ".usda" and _USDA_BYTES * vertices * (frames or 0) > MAX_USDA:
+        raise FormatError(
+            f"{path}: {frames} frames of {vertices} vertices are too many for text: write .usdc."
+        )
     check_writable(path, _VERTEX_BYTES[path.suffix.lower()] * vertices * (frames or 0))
     return path
 
@@ -98,12 +107,7 @@ def write_clip(
     if suffix.startswith(".usd"):
         return write_usd(path, meshes, fps, velocities=velocities)
     if suffix == ".npz":
-        arrays = {"fps": np.asarray(fps)}
-        for m in meshes:
-            arrays[f"{m.name}_positions"] = m.positions
-            arrays[f"{m.name}_faces"] = m.faces
-        with atomic_write(path) as part, part.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        _write_npz(path, meshes, fps)
         return [path]
     if suffix in (".glb", ".html"):
         write = write_gltf if suffix == ".glb" else write_html
@@ -123,6 +127,30 @@ def write_clip(
                     break
                 left.unlink()
     return written
+
+
+def _write_npz(path: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
+    """Writes an archive of arrays, positions by chunks."""
+    with (
+        atomic_write(path) as part,
+        zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, allowZip64=True) as archive,
+    ):
+
+        def add(name: str, x: np.ndarray) -> None:
+            # A date of its own, so that equal clips are equal files.
+            entry = zipfile.ZipInfo(f"{name}.npy")
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            with archive.open(entry, "w", force_zip64=True) as file:
+                descr = np.lib.format.dtype_to_descr(x.dtype)
+                header = {"descr": descr, "fortran_order": False, "shape": x.shape}
+                np.lib.format.write_array_header_1_0(file, header)
+                for rows in in_chunks(x) if x.ndim == 3 else [x]:
+                    file.write(np.ascontiguousarray(rows).data)
+
+        add("fps", np.asarray(fps))
+        for m in meshes:
+            add(f"{m.name}_positions", m.positions)
+            add(f"{m.name}_faces", m.faces)
 
 
 def _stem(path: pathlib.Path, mesh: AnimatedMesh) -> str:
@@ -148,7 +176,8 @@ def _write_parts(
         write_mdd(part(f"{stem}{suffix}"), m.positions, fps)
     elif cached:
         write_pc2(part(f"{stem}{suffix}"), m.positions)
-    for k, x in enumerate(m.positions[:1] if cached else m.positions):
+    shown = m.positions[:1] if cached else m.positions
+    for k, x in enumerate(itertools.chain.from_iterable(in_chunks(shown))):
         name = f"{stem}.obj" if cached else f"{stem}_{k:04d}.obj"
         write_obj(part(name), x, m.faces, m.uv, m.uv_faces, polygons=drawn, library=library)
     return written

@@ -16,6 +16,7 @@ from ._motion import (
     Motion as Motion,
     animate as animate,
     body_animation as body_animation,
+    body_blocks as body_blocks,
     ground_point as ground_point,
     make_motion as make_motion,
     resample as resample,

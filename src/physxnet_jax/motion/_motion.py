@@ -1,6 +1,7 @@
 """Motion of the body: joint rotations, root position and frame rate."""
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -16,6 +17,8 @@ from ._source import MAX_JOINT_FRAMES
 
 # Frames per block: clips of any length share one compiled program.
 _BLOCK = 32
+# Frames that are normalised at once.
+_PART = 4096
 # A root farther from the origin than this indicates a damaged file [m].
 _FARTHEST = 1e5
 ROTATION_LENGTHS = (1e-6, 1e6)
@@ -119,7 +122,7 @@ def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "mot
             f"{name}: frame {frame}, joint {joint} is not finite or over"
             " 100 km away. Cut the frame out or interpolate over it."
         )
-    largest = np.abs(r).max(axis=2, keepdims=True)
+    largest = np.maximum(r.max(axis=2, keepdims=True), -r.min(axis=2, keepdims=True))
     wrong = (largest < ROTATION_LENGTHS[0]) | (largest > ROTATION_LENGTHS[1])
     if wrong.any():
         frame, joint, _ = (int(x) for x in np.argwhere(wrong)[0])
@@ -128,10 +131,13 @@ def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "mot
             f"{name}: frame {frame}, joint {joint} has a {kind} quaternion; use"
             " (1, 0, 0, 0) for no rotation."
         )
-    r = r / largest
-    r = r / np.linalg.norm(r, axis=2, keepdims=True)
+    out = np.empty(r.shape, np.float32)
+    # By parts, as copies of a long clip fill the memory.
+    for at in range(0, len(r), _PART):
+        part = r[at : at + _PART] / largest[at : at + _PART]
+        out[at : at + _PART] = part / np.linalg.norm(part, axis=2, keepdims=True)
     return Motion(
-        jnp.asarray(r.astype(np.float32)),
+        jnp.asarray(out),
         jnp.asarray(p.astype(np.float32)),
         float(fps),
         name,
@@ -190,8 +196,15 @@ def body_animation(
     body: Body, motion: Motion, shape: Float[Array, " shapes"] | None = None
 ) -> Float[Array, "frames vertices 3"]:
     """Body vertices [m] of every frame, computed in blocks to bound memory."""
+    return jnp.asarray(np.concatenate(list(body_blocks(body, motion, shape))))
+
+
+def body_blocks(
+    body: Body, motion: Motion, shape: Float[Array, " shapes"] | None = None
+) -> Iterator[Float[np.ndarray, "some vertices 3"]]:
+    """Yields the frames of `body_animation` in blocks."""
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
-    return animate(body, rest, rest[:NUM_BODY_VERTICES], _body_weights(body), motion)
+    yield from animation_blocks(body, rest, rest[:NUM_BODY_VERTICES], _body_weights(body), motion)
 
 
 def animate(
@@ -215,6 +228,19 @@ def animate(
     Returns:
         Positions [m] of every frame.
     """
+    return jnp.asarray(
+        np.concatenate(list(animation_blocks(body, rest, vertices, weights, motion)))
+    )
+
+
+def animation_blocks(
+    body: Body,
+    rest: Float[Array, "all 3"],
+    vertices: Float[Array, "vertices 3"],
+    weights: Float[Array, "vertices joints"],
+    motion: Motion,
+) -> Iterator[Float[np.ndarray, "some vertices 3"]]:
+    """Yields the frames of `animate` in blocks."""
     check_joints(body, motion)
     frames = motion.num_frames
     place = ground_point(motion)
@@ -222,12 +248,10 @@ def animate(
     pick = np.minimum(np.arange(-(-frames // _BLOCK) * _BLOCK), frames - 1)
     rotations = np.asarray(motion.rotations)[pick].reshape(-1, _BLOCK, *motion.rotations.shape[1:])
     root = np.asarray(motion.root)[pick].reshape(-1, _BLOCK, 3)
-    blocks = [
-        np.asarray(_animate_block(body, rest, vertices, weights, q, p))
-        for q, p in zip(rotations, root, strict=True)
-    ]
-    positions = np.concatenate(blocks)[:frames]
-    return jnp.asarray(positions + place if place.any() else positions)
+    for k, (q, p) in enumerate(zip(rotations, root, strict=True)):
+        block = np.asarray(_animate_block(body, rest, vertices, weights, q, p))
+        block = block[: frames - k * _BLOCK]
+        yield block + place if place.any() else block
 
 
 def check_joints(body: Body, motion: Motion) -> None:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ..body import NUM_BODY_VERTICES, Body, align_global, load_body
 from ..errors import MotionError
-from ._motion import Motion, animate, make_motion
+from ._motion import Motion, animation_blocks, make_motion
 from ._reference import LONGEST, SHORTEST, limb_directions, reference_pose, upright
 from ._skeletons import NEEDED, find_joint_map, nearest_joint_map
 from ._source import SourceClip
@@ -17,6 +17,8 @@ from ._source import SourceClip
 # Longest blend from a T-pose at a clip's start [s], and how much faster it turns than the 95th
 # percentile of the clip (factor).
 _MAX_BLEND, _BLEND_SPEED = 0.25, 1.5
+# Frames that are retargeted at once.
+_PART = 4096
 # Share of frames that may go through the floor [1], by more than this [m].
 _ODD_FRAMES, THROUGH = 0.05, 0.03
 
@@ -65,12 +67,11 @@ def retarget(
     directions = limb_directions(source, index, reference)
     aligned = align_global(body, {k: stance.T @ d for k, d in directions.items()}, shape)
     aligned = _twisted(body, [Rotation.from_matrix(stance) * a for a in aligned], stance, twist)
-    world = _world_rotations(body, source, index, reference, aligned, start)
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     heads = np.asarray(body.joint_positions(rest)[0], dtype=np.float64)
     at = body.joint_names.index
-    positions = source.positions()[start:]
-    legs = leg_length(positions[0], index.__getitem__)
+    first = source.part(start, start + 1)
+    legs = leg_length(first.positions()[0], index.__getitem__)
     if not SHORTEST < legs < LONGEST:
         raise MotionError.at(
             source.path,
@@ -81,16 +82,16 @@ def retarget(
     scale = leg_length(heads, at) / legs
     hips = [index["LeftUpLeg"], index["RightUpLeg"]]
     middle = 0.5 * (heads[at("LeftUpLeg")] + heads[at("RightUpLeg")]) - heads[0]
-    root = scale * positions[:, hips].mean(axis=1) - world[:, 0] @ middle
-    local = world.copy()
-    for j, parent in enumerate(body.parents):
-        if parent >= 0:
-            local[:, j] = np.swapaxes(world[:, parent], 1, 2) @ world[:, j]
-    quaternions = continuous(
-        Rotation.from_matrix(local.reshape(-1, 3, 3))
-        .as_quat(scalar_first=True)
-        .reshape(len(root), -1, 4)
-    )
+    frames = len(source.root) - start
+    quaternions, root = np.empty((frames, len(body.parents), 4)), np.empty((frames, 3))
+    # By parts: matrices take several times what quaternions take.
+    for at in range(0, frames, _PART):
+        part = source.part(start + at, start + at + _PART)
+        world = _world_rotations(body, part, index, reference, aligned)
+        rows = slice(at, at + len(world))
+        root[rows] = scale * part.positions()[:, hips].mean(axis=1) - world[:, 0] @ middle
+        quaternions[rows] = _local_quaternions(body, world)
+    quaternions = continuous(quaternions)
     if start:
         quaternions, root = _without_t_pose_blend(quaternions, root, source.fps)
     motion = make_motion(quaternions, root, source.fps, name=source.name)
@@ -203,8 +204,8 @@ def foot_heights(
     """Height of the lowest vertex of both feet in each frame [m]."""
     rows = np.flatnonzero(_foot_vertices(body))
     feet, weights = (jnp.asarray(np.asarray(x)[rows]) for x in (rest, body.weights))
-    moved = animate(body, rest, feet, weights, motion)
-    return np.asarray(moved)[:, :, 1].min(axis=1)
+    blocks = animation_blocks(body, rest, feet, weights, motion)
+    return np.concatenate([x[:, :, 1].min(axis=1) for x in blocks])
 
 
 def _foot_vertices(body: Body) -> Bool[np.ndarray, " vertices"]:
@@ -220,9 +221,8 @@ def _world_rotations(
     index: Mapping[str, int],
     reference: Float[np.ndarray, "bones 3 3"],
     aligned: list[Rotation],
-    start: int,
 ) -> Float[np.ndarray, "frames joints 3 3"]:
-    frames = source.rotations[start:]
+    frames = source.rotations
     world = np.zeros((len(frames), len(body.parents), 3, 3))
     for j, (name, parent) in enumerate(zip(body.joint_names, body.parents, strict=True)):
         if name in index:
@@ -234,10 +234,22 @@ def _world_rotations(
     return world
 
 
+def _local_quaternions(
+    body: Body, world: Float[np.ndarray, "frames joints 3 3"]
+) -> Float[np.ndarray, "frames joints 4"]:
+    local = world.copy()
+    for j, parent in enumerate(body.parents):
+        if parent >= 0:
+            local[:, j] = np.swapaxes(world[:, parent], 1, 2) @ world[:, j]
+    turns = Rotation.from_matrix(local.reshape(-1, 3, 3)).as_quat(scalar_first=True)
+    return turns.reshape(*world.shape[:2], 4)
+
+
 def continuous(
     q: Float[np.ndarray, "frames joints 4"],
 ) -> Float[np.ndarray, "frames joints 4"]:
     """Flips signs so that successive quaternions are near each other."""
-    flips = np.sign(np.sum(q[1:] * q[:-1], axis=2, keepdims=True))
-    sign = np.cumprod(np.where(flips == 0, 1.0, flips), axis=0)
-    return np.concatenate([q[:1], q[1:] * sign])
+    flips = np.sign(np.einsum("fjc,fjc->fj", q[1:], q[:-1]))[..., None]
+    out = q.copy()
+    out[1:] *= np.cumprod(np.where(flips == 0, 1.0, flips), axis=0)
+    return out

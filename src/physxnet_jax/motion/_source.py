@@ -77,6 +77,13 @@ class SourceClip:
                 out[:, j] = out[:, parent] + step
         return out
 
+    def part(self, start: int, stop: int) -> "SourceClip":
+        """Some successive frames."""
+        shifts = None if self.shifts is None else self.shifts[start:stop]
+        return dataclasses.replace(
+            self, rotations=self.rotations[start:stop], root=self.root[start:stop], shifts=shifts
+        )
+
     def turned(self, turn: Float[np.ndarray, "3 3"]) -> "SourceClip":
         """The clip with the whole world rotated, including its rest pose."""
         rest = self.rest_rotations()

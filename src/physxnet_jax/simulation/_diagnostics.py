@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ..errors import SimulationError
+from ..frames import moved_frames
 
 
 class Status(enum.IntFlag):
@@ -100,7 +101,9 @@ class Rollout:
         """The rollout with all positions displaced [m]."""
         if not by.any():
             return self
-        return dataclasses.replace(self, positions=tuple(x + by for x in self.positions))
+        return dataclasses.replace(
+            self, positions=tuple(moved_frames(x, by) for x in self.positions)
+        )
 
     @property
     def finite(self) -> Bool[np.ndarray, " frames"]:

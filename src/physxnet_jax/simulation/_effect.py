@@ -223,3 +223,7 @@ class Effect:
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """The prepared effect for these garments on this body."""
         raise TypeError(f"{type(self).__name__} does not implement prepare().")
+
+    def idle(self, assembly: Assembly) -> bool:
+        """Whether it does nothing to these garments, so that it is left out of the program."""
+        return False

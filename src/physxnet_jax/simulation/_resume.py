@@ -1,11 +1,11 @@
-"""Storage of unfinished rollouts, so that they can be resumed."""
+"""Storage of unfinished clips, so that they can be resumed."""
 
 import contextlib
 import hashlib
+import itertools
 import pathlib
-import zipfile
-import zlib
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -13,31 +13,36 @@ import numpy as np
 
 from .._version import __version__
 from ..errors import SimulationError
-from ..files import atomic_write
+from ..files import atomic_write, read_arrays
+
+_State = TypeVar("_State")
 
 
 class Resume:
-    """A folder with the finished blocks of frames of a rollout.
+    """A folder with the finished blocks of frames of a clip.
 
     Each block is one file, written atomically, with the cloth's state at its end. The
     folder belongs to one scene, motion and solver; others are rejected.
 
     Args:
         folder: Folder of the blocks; created if needed, removed by `finish`.
-        key: Identifies the rollout, see `fingerprint`.
+        key: Identifies the clip, see `fingerprint`.
+        keep: Whether blocks of another clip are an error; they are removed otherwise.
 
     Raises:
-        SimulationError: The folder contains another rollout or other files.
+        SimulationError: The folder contains another clip or other files.
     """
 
-    def __init__(self, folder: str | pathlib.Path, key: str) -> None:
+    def __init__(self, folder: str | pathlib.Path, key: str, *, keep: bool = True) -> None:
         self.folder = pathlib.Path(folder)
         label = self.folder / "key.txt"
         if label.is_file() and label.read_text() != key:
-            raise SimulationError(
-                f"{self.folder} contains an unfinished rollout of another scene, motion or"
-                " setting. Finish that rollout, or remove the folder."
-            )
+            if keep:
+                raise SimulationError(
+                    f"{self.folder} contains an unfinished rollout of another scene, motion or"
+                    " setting. Finish that rollout, or remove the folder."
+                )
+            self.finish()
         if not label.is_file() and self.folder.is_dir() and any(self.folder.iterdir()):
             raise SimulationError(
                 f"{self.folder} contains files that don't belong to a rollout. Choose an empty or"
@@ -46,37 +51,37 @@ class Resume:
         with atomic_write(label) as part:
             part.write_text(key)
 
-    def load(self, state: Any) -> tuple[Any, list[np.ndarray], list[dict[str, np.ndarray]]]:
-        """The last state (with the given structure), positions and diagnostics of all blocks.
+    def blocks(self, state: _State) -> Iterator[tuple[_State, dict[str, np.ndarray]]]:
+        """Yields the state at the end of each block and the block's arrays, in order.
+
+        Args:
+            state: A state of the same structure.
 
         Raises:
             SimulationError: A block is damaged.
         """
-        positions, diagnostics = [], []
         leaves, tree = jax.tree.flatten(state)
-        while (path := self._path(len(positions))).is_file():
+        for index in itertools.count():
+            path = self._path(index)
+            if not path.is_file():
+                return
             try:
-                with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
-                    frames = data["positions"]
-                    info = {k[5:]: data[k] for k in data.files if k.startswith("info_")}
-                    leaves = [jnp.asarray(data[f"state_{i}"]) for i in range(len(leaves))]
-            except (ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+                data = read_arrays(path)
+                arrays = {k[6:]: x for k, x in data.items() if k.startswith("array_")}
+                found = [jnp.asarray(data[f"state_{i}"]) for i in range(len(leaves))]
+            except (ValueError, KeyError, OSError) as error:
                 raise SimulationError(
                     f"{path}: damaged ({type(error).__name__}). Delete it and the blocks after it;"
                     " the rollout then resumes from the block before."
                 ) from None
-            positions.append(frames)
-            diagnostics.append(info)
-        return jax.tree.unflatten(tree, leaves), positions, diagnostics
+            yield jax.tree.unflatten(tree, found), arrays
 
-    def save(
-        self, index: int, state: Any, positions: np.ndarray, diagnostics: dict[str, np.ndarray]
-    ) -> None:
+    def save(self, index: int, state: Any, arrays: Mapping[str, np.ndarray]) -> None:
         """Writes one block."""
-        arrays = {f"state_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
-        arrays |= {f"info_{k}": v for k, v in diagnostics.items()}
+        entries = {f"state_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(state))}
+        entries |= {f"array_{k}": v for k, v in arrays.items()}
         with atomic_write(self._path(index)) as part, part.open("wb") as file:
-            np.savez(file, allow_pickle=False, positions=positions, **arrays)
+            np.savez(file, allow_pickle=False, **entries)  # pyright: ignore[reportArgumentType]
 
     def finish(self) -> None:
         """Removes all blocks, and the folder if it is then empty."""

@@ -15,6 +15,7 @@ from ..body import Body
 from ..devices import make_mesh
 from ..errors import SimulationError
 from ..files import claims
+from ..frames import FrameStore
 from ..motion import Motion, animate, ground_point
 from ._advance import advance_on, start_state
 from ._assembly import float32
@@ -222,13 +223,25 @@ def _roll(
     # Time zero is the clip's first frame, whatever the length of the warm-up.
     start_time = -(warmup_frames - 1) / fps
     store = None
-    positions: list[np.ndarray] = []
     diagnostics: list[dict[str, np.ndarray]] = []
+    frames_of = [FrameStore(m.num_frames) for m in motions]
+
+    def keep(arrays: dict[str, np.ndarray]) -> None:
+        """Keeps a block without the frames of the warm-up, and those after a motion's end."""
+        first = ROLLOUT_BLOCK * len(diagnostics) - (warmup_frames - 2)
+        block = arrays.pop("positions")
+        diagnostics.append(arrays)
+        for b, (m, kept) in enumerate(zip(motions, frames_of, strict=True)):
+            rows = slice(max(-first, 0), max(m.num_frames - first, 0))
+            kept.append(block[rows, :, :, b])
+
     if resume is not None:
         key = fingerprint(system, rotations, root, (solver, energies, fps))
         store = Resume(resume, key)
-        state, positions, diagnostics = store.load(state)
-    for at in range(ROLLOUT_BLOCK * len(positions), total - 1, ROLLOUT_BLOCK):
+        for reached, arrays in store.blocks(state):
+            state = reached
+            keep(arrays)
+    for at in range(ROLLOUT_BLOCK * len(diagnostics), total - 1, ROLLOUT_BLOCK):
         part = slice(at, at + ROLLOUT_BLOCK + 1)
         state, new_positions, info = advance_on(
             mesh,
@@ -241,27 +254,26 @@ def _roll(
             time=jnp.asarray(start_time + at / fps, solver.precision),
             energies=energies,
         )
-        positions.append(np.asarray(new_positions))
-        diagnostics.append({k: np.asarray(v) for k, v in info.items()})
+        arrays = {"positions": new_positions} | info
+        arrays = {k: np.asarray(v) for k, v in arrays.items()}
         if store is not None:
-            store.save(len(positions) - 1, state, positions[-1], diagnostics[-1])
+            store.save(len(diagnostics), state, arrays)
+        keep(arrays)
         if progress is not None:
             progress(min(at + ROLLOUT_BLOCK, total - 1), total - 1)
     if store is not None:
         store.finish()
     # Diagnostics start at frame 1, as the rest state has none; it belongs to the warm-up.
-    every = np.concatenate([np.asarray(x)[None], *positions])
     values = {k: np.concatenate([d[k] for d in diagnostics]) for k in diagnostics[0]}
     out = []
     for b, m in enumerate(motions):
-        frames = slice(warmup_frames - 1, warmup_frames - 1 + m.num_frames)
         flags = slice(warmup_frames - 2, warmup_frames - 2 + m.num_frames)
         garments = zip(scene.assembly.parts, scene.assembly.parts[1:])
-        cloth = every[frames, :, :, b]
+        cloth = frames_of[b].array()
         slid = slipped(scene.assembly, m, cloth).max(axis=1, initial=0.0)
         out.append(
             Rollout(
-                tuple(np.ascontiguousarray(cloth[:, i:j]) for i, j in garments),
+                tuple(cloth[:, i:j] for i, j in garments),
                 fps,
                 {k: v[flags, b] for k, v in values.items()} | {"slipped": slid},
                 m.name,

@@ -125,7 +125,7 @@ class Scene:
         garments: Garments, innermost first. With `LayerContact` each stays over the
             ones before it; without it they don't interact.
         effects: Effects, applied in this order within a substep. An effect that isn't
-            listed isn't computed.
+            listed isn't computed, nor is one that has nothing to do, as pins of nothing.
         body: The body; the built-in one if None.
         shape: Shape parameters of the body; the default if None.
     """
@@ -169,7 +169,8 @@ def prepare_scene(scene: Scene) -> PreparedScene:
         held = assembly.pinned if Pin in kinds else np.zeros_like(assembly.pinned)
         inverse = np.where(held, 0.0, 1.0 / assembly.mass)
         inverse_mass = jnp.asarray(inverse.astype(np.float32))
-        prepared = tuple(e.prepare(assembly, inverse_mass) for e in scene.effects)
+        acting = (e for e in scene.effects if not e.idle(assembly))
+        prepared = tuple(e.prepare(assembly, inverse_mass) for e in acting)
     return PreparedScene(assembly, prepared, inverse_mass[:, None, None])
 
 

@@ -32,7 +32,7 @@ def slipped(
     padded = np.resize(vertices, -(-len(vertices) // _PADDED) * _PADDED)
     rest, weights = float32(assembly.rest[padded]), float32(assembly.weights[padded])
     carried = np.asarray(animate(assembly.body, float32(assembly.rest_body), rest, weights, motion))
-    gap = np.asarray(positions, np.float64)[:, vertices] - carried[:, : len(vertices)]
+    gap = np.asarray(positions[:, vertices], np.float64) - carried[:, : len(vertices)]
     start = 0
     for k, curve in curves:
         middle = gap[:, start : start + len(curve)].mean(axis=1)

@@ -12,6 +12,15 @@ from ._job import Choice, Shown, run_job
 from ._server import start_server
 from ._stage import Stage
 
+# viser's page unpacks its scripts itself; whatever they do, nothing leaves the page.
+_POLICY = (
+    '<meta http-equiv="Content-Security-Policy" content="'
+    "default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval' blob: data:;"
+    " style-src 'unsafe-inline' blob: data:; img-src blob: data:; font-src blob: data:;"
+    " media-src blob: data:; connect-src blob: data:; worker-src blob: data:;"
+    " base-uri 'none'; form-action 'none'\">"
+)
+
 
 def record(
     path: str | pathlib.Path,
@@ -40,7 +49,7 @@ def record(
         for frame in range(shown.num_frames):
             stage.show(frame)
             serializer.insert_sleep(1.0 / shown.clip.fps)
-        text = serializer.as_html()
+        text = serializer.as_html().replace("<head>", f"<head>{_POLICY}", 1)
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()

@@ -68,21 +68,23 @@ class Stage:
             worn: Vertices of garments [m] that replace those of the clip.
         """
         shown = self.shown
-        # The camera stays: person and floor move beneath it.
-        away = -self._middle[frame]
-        self._person.position = away
+        # The camera stays: person and floor move beneath it. Not by the frame that holds them: a
+        # browser shows new vertices later than a new place, and cloth would lag behind.
+        away = -self._middle[frame].astype(np.float32)
         self._floor.position = np.array([away[0] % 1.0, 0.0, away[2] % 1.0])
         turns = Rotation.from_matrix(shown.world[frame]).as_quat(scalar_first=True)
         for place, body in zip((0.0 * BESIDE, BESIDE), self._bodies, strict=False):
-            for bone, q, p in zip(body.bones, turns, shown.shift[frame] + place, strict=True):
+            for bone, q, p in zip(
+                body.bones, turns, shown.shift[frame] + place + away, strict=True
+            ):
                 bone.wxyz, bone.position = q, p
         for mesh, place, handle in self._meshes:
             here = None if worn is None or place is BESIDE else worn.get(mesh.name)
-            handle.vertices = (mesh.positions[frame] if here is None else here) + place
+            handle.vertices = (mesh.positions[frame] if here is None else here) + (place + away)
         for mesh in shown.garments:
             if mesh.name in self._dots:
                 dots = self._dots[mesh.name]
-                dots.points = mesh.positions[frame]
+                dots.points = mesh.positions[frame] + away
                 dots.colors = heat(shown.distances[mesh.name][frame])
 
     def clear(self) -> None:

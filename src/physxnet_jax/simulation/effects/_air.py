@@ -69,6 +69,10 @@ class Air(Effect):
         if self.shelter > 1.0:
             raise ValueError(f"shelter is {self.shelter}, expected a share from 0 to 1")
 
+    def idle(self, assembly: Assembly) -> bool:
+        """In a vacuum, or without drag."""
+        return self.density == 0.0 or self.normal == self.tangent == 0.0
+
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Builds tables of the faces around vertices, and modes if there is turbulence."""
         x, f = assembly.rest, assembly.faces
@@ -170,31 +174,40 @@ class _Air(Prepared):
         end: PosedPoints | None,
         clock: Clock,
         state: Any,
-    ) -> tuple[Array, Array]:
+    ) -> tuple[Array, Array | None]:
         a, b, c = (base[self.faces[:, k]] for k in range(3))
         normal = jnp.cross(b - a, c - a, axis=1)
         total = jnp.sum(normal[self.around] * self.once, axis=1)
         unit = total / jnp.sqrt(jnp.sum(total * total, axis=1, keepdims=True) + 1e-18)
-        gust_factor = 1.0 + self.law.gust * jnp.sin(2 * jnp.pi / self.law.period * clock.time)
-        mean = jnp.asarray(self.law.wind, base.dtype)[None, :, None]
-        wind = jnp.broadcast_to(gust_factor * mean, base.shape)
-        if self.lee is not None and start is not None:
+        wind, moving_frame = None, base
+        if any(self.law.wind):
+            mean = jnp.asarray(self.law.wind, base.dtype)[None, :, None]
+            # Eddies move with the wind.
+            moving_frame = base - clock.time * mean
+            if self.law.gust:
+                pulse = jnp.sin(2 * jnp.pi / self.law.period * clock.time)
+                mean = (1.0 + self.law.gust * pulse) * mean
+            wind = jnp.broadcast_to(mean, base.shape)
+        if wind is not None and self.lee is not None and start is not None:
             wind = wind * (1.0 - self.law.shelter * self.lee.shade(base, start, self.law.wind))
         if self.modes is not None:
             k, way, rate, phase = self.modes
-            # Eddies move with the wind.
-            moving_frame = base - clock.time * mean
             angle = jnp.einsum("mc,vcb->vmb", k, moving_frame, precision=jax.lax.Precision.HIGHEST)
             angle = angle - (rate * clock.time - phase)[None, :, None]
-            wind = wind + jnp.einsum(
+            eddies = jnp.einsum(
                 "vmb,mc->vcb", jnp.cos(angle), way, precision=jax.lax.Precision.HIGHEST
             )
+            wind = eddies if wind is None else wind + eddies
         return unit, wind
 
-    def accelerate(self, velocity: Array, context: tuple[Array, Array], h: float) -> Array:
+    def accelerate(self, velocity: Array, context: tuple[Array, Array | None], h: float) -> Array:
         unit, wind = context
-        u = velocity - wind
+        u = velocity if wind is None else velocity - wind
         across = jnp.sum(u * unit, axis=1, keepdims=True) * unit
         speed = jnp.sqrt(jnp.sum(u * u, axis=1, keepdims=True) + 1e-12)
-        decay = lambda c: 1.0 / (1.0 + h * self.load * c * speed)  # noqa: E731
-        return wind + decay(self.law.normal) * across + decay(self.law.tangent) * (u - across)
+
+        def slowed(part: Array, drag: float) -> Array:
+            return part * (1.0 / (1.0 + h * self.load * drag * speed)) if drag else part
+
+        left = slowed(across, self.law.normal) + slowed(u - across, self.law.tangent)
+        return left if wind is None else wind + left

@@ -26,6 +26,10 @@ class Damping(Effect):
     def __post_init__(self) -> None:
         check_numbers(self, "rate", zero=True)
 
+    def idle(self, assembly: Assembly) -> bool:
+        """At rate 0."""
+        return self.rate == 0.0
+
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Needs nothing from the scene."""
         return _Damping(self.rate)

@@ -37,6 +37,10 @@ class Elastic(Effect):
         check_numbers(self, "tension")
         check_numbers(self, "gathered", zero=True)
 
+    def idle(self, assembly: Assembly) -> bool:
+        """Without a band."""
+        return not len(assembly.bands)
+
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Colours the bands' edges so that a Gauss-Seidel sweep runs colour by colour."""
         edges, x = assembly.bands, assembly.rest

@@ -24,6 +24,10 @@ class Gravity(Effect):
         if not math.isfinite(self.g):
             raise ValueError(f"g is {self.g}, expected a finite number")
 
+    def idle(self, assembly: Assembly) -> bool:
+        """Weightless."""
+        return self.g == 0.0
+
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Acts on pinned vertices too; `Pin` resets them."""
         return _Gravity(self.g)

@@ -75,6 +75,10 @@ class LayerContact(Effect):
         check_numbers(self, "gap", "friction", "leave", zero=True)
         check_counts(self, "hops", "ring", "patch")
 
+    def idle(self, assembly: Assembly) -> bool:
+        """With a single garment."""
+        return len(assembly.parts) < 3
+
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Builds tables of each garment's surface and the first vertex of each search."""
         x, parts = assembly.rest, assembly.parts
@@ -203,15 +207,17 @@ class _Layers(ClothContact):
         theirs = jnp.sum(weights**2 * self.inverse_mass[pairs.corners, 0, 0], axis=0)[:, None]
         share = mine / (mine + theirs + 1e-9)
         relative = displacement[self.rows] - foot_of(displacement, pairs.corners, weights)
-        before = start[self.rows] - foot_of(start, pairs.corners, weights)
         height = pairs.height + jnp.sum(relative * n, axis=1, keepdims=True)
         wanted = wanted_height(pairs.height, law, progress * context.clock.length)
         depth = jnp.maximum(wanted - height, 0.0) * pairs.active
-        slide = relative - before
-        slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
-        length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
-        hold = jnp.minimum(1.0, law.friction * depth / length)
-        move = share * (depth * n - hold * slide)
+        move = depth * n
+        if law.friction:
+            before = start[self.rows] - foot_of(start, pairs.corners, weights)
+            slide = relative - before
+            slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
+            length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
+            move = move - jnp.minimum(1.0, law.friction * depth / length) * slide
+        move = share * move
         for i, j in zip(self.blocks, self.blocks[1:]):
             rows = self.rows[i:j]
             displacement = displacement.at[rows].add(

@@ -176,11 +176,13 @@ def separate_pairs(
     depth = jnp.maximum(target - height, 0.0) * pairs.active
     inertia = sum(s[:, None] ** 2 * w for s, w in zip(share, mass, strict=True))
     lift = depth / (inertia + 1e-9)
-    slide = relative - pairs.motion(start)
-    slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
-    length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
-    hold = jnp.minimum(1.0, law.friction * depth / length) / (inertia + 1e-9)
-    move = lift * n - jnp.where(depth > 0, hold, 0.0) * slide
+    move = lift * n
+    if law.friction:
+        slide = relative - pairs.motion(start)
+        slide = slide - jnp.sum(slide * n, axis=1, keepdims=True) * n
+        length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
+        hold = jnp.minimum(1.0, law.friction * depth / length) / (inertia + 1e-9)
+        move = move - jnp.where(depth > 0, hold, 0.0) * slide
     total = jnp.zeros_like(displacement)
     count = jnp.zeros_like(displacement[:, :1])
     acts = (depth > 0).astype(displacement.dtype)

@@ -16,6 +16,10 @@ from .._effect import Clock, Effect, PosedPoints, Prepared, Rest, SkinnedPoints,
 class Pin(Effect):
     """Keeps the pinned vertices of each garment exactly at their skinned positions."""
 
+    def idle(self, assembly: Assembly) -> bool:
+        """Without a pinned vertex."""
+        return not assembly.pinned.any()
+
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Collects the pinned vertices of all garments."""
         rows = np.flatnonzero(assembly.pinned)

@@ -32,6 +32,10 @@ class Seam(Effect):
     def __post_init__(self) -> None:
         check_numbers(self, "stiffness")
 
+    def idle(self, assembly: Assembly) -> bool:
+        """Without stitches."""
+        return not self.stitches
+
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Colours the stitches so that a Gauss-Seidel sweep runs colour by colour."""
         pairs = np.asarray(self.stitches, np.int64).reshape(-1, 2)

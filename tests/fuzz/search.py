@@ -1,13 +1,13 @@
 """Readers under a fuzzer that sees which lines its inputs reach.
 
-Command: pip install atheris; python experiments/fuzz_nightly.py bvh
+Command: pip install atheris; python tests/fuzz/search.py bvh
          --seconds 600, --corpus runs/fuzz: what was found is kept and gone on from.
          `all` takes the readers in turn, each in a process of its own.
 Cost:    what --seconds says, for each reader.
 Result:  nothing; an input that breaks a reader in any other way than by one of the package's
          own errors is written to the corpus as crash-..., and the exit status isn't 0.
 
-Readers and their good files are those of tests/test_fuzz.py.
+Readers and their good files are those of readers.py.
 """
 
 import argparse
@@ -17,14 +17,14 @@ import subprocess
 import sys
 import tempfile
 
-import atheris
-
-TESTS = pathlib.Path(__file__).parents[1] / "tests/test_fuzz.py"
+TESTS = pathlib.Path(__file__).with_name("readers.py")
 INSTRUMENTED = ["physxnet_jax.motion", "physxnet_jax.io", "physxnet_jax.files"]
 
 
 def fuzz(name: str, seconds: int, corpus: pathlib.Path) -> None:
     """Doesn't return: the fuzzer ends the process."""
+    import atheris
+
     with atheris.instrument_imports(include=INSTRUMENTED):
         made = runpy.run_path(str(TESTS))
     corpus.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,10 @@
-"""Readers of files from anywhere: damaged input gives an answer or one clear error.
+"""Readers of files from anywhere, a good file of each, and how to damage it.
 
-`python tests/test_fuzz.py SECONDS` goes on longer, with other seeds each time.
+`python tests/fuzz/readers.py SECONDS` damages files until the time is over, with other seeds each time.
 """
 
 import base64
+import dataclasses
 import hashlib
 import json
 import pathlib
@@ -13,20 +14,32 @@ import shutil
 import sys
 import tempfile
 import time
-import tracemalloc
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings, strategies as st
 
+from physxnet_jax.data import (
+    list_sequences,
+    open_dataset,
+    read_note,
+    read_protocol,
+    read_sequence,
+    write_action,
+    write_garment,
+    write_offsets,
+)
 from physxnet_jax.dressing import load_scene, read_character
 from physxnet_jax.errors import FormatError, PhysXNetError
+from physxnet_jax.garment import square_sheet
 from physxnet_jax.io import read_mdd, read_mesh, read_obj, read_pc2
 from physxnet_jax.models import load_predictor
 from physxnet_jax.motion import load_motion, read_amc, read_bvh, read_joint_map
+from physxnet_jax.simulation import Resume
+from physxnet_jax.training import Checkpoints
 
-_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[0] / "samples.py"))
+_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
 BVH, ASF, AMC = (_SAMPLES[name] for name in ("BVH", "ASF", "AMC"))
 OBJ = "o a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 1\nvt 0 0\nvt 1 1\nf 1/1 2/2 3/1\nf 2 4 3\nf -1 -2 -3 -4\n"
 SCENE = (
@@ -38,6 +51,8 @@ PLY = (
     b"0 0 0\n1 0 0\n0 1 0\n1 1 1\n3 0 1 2\n3 1 3 2\n"
 )
 MTL = "newmtl red\nKd 1 0 0\nd 0.5\nmap_Kd -s 1 1 1 red.png\n\nnewmtl blue\nKd 0 0 1\nNs 10\n"
+ACTIONS = b"split,action,file,start_s,frames_at_30fps,note\ntrain,walk,a.bvh,0.5,20,x\ntest,run,b.bvh,0,9,\n"
+CLIPS = b"file,fps\na.bvh,120\nb.bvh,60\n"
 NAMES = 'Hips = "a"\nLeftLeg = "b"\n'
 
 
@@ -266,35 +281,150 @@ def _weights(name):
     ).read_bytes()
 
 
-# Name: what a good file holds, its ending, its reader, and how many damages a test tries.
+def _protocol(name):
+    """One of the two tables of a folder of motions, the other one good."""
+
+    def read(path):
+        folder = path.parent / "protocol"
+        folder.mkdir(exist_ok=True)
+        (folder / "ACTIONS.csv").write_bytes(ACTIONS)
+        (folder / name).write_bytes(path.read_bytes())
+        return read_protocol(folder)
+
+    return read
+
+
+def _dataset(folder):
+    """A dataset of one action with a small sheet."""
+    root = folder / "dataset"
+    if not root.is_dir():
+        sheet = square_sheet(4)
+        x = np.asarray(sheet.mesh.vertices)
+        open_dataset(root, {"engine": "physxnet"})
+        write_garment(root, "top", x, np.asarray(sheet.mesh.faces))
+        write_action(root / "walk", load_motion("walk"), "train")
+        # A chunk of zeros isn't stored.
+        offsets = np.random.default_rng(0).normal(size=(5, *x.shape)).astype(np.float32)
+        write_offsets(root / "walk", "top", 0.01 * offsets, {"finite": True})
+    return root
+
+
+def _stored(pattern):
+    """A file of the dataset."""
+    return lambda folder: next(_dataset(folder).glob(pattern)).read_bytes()
+
+
+def _dataset_with(pattern):
+    def read(path):
+        root = _dataset(path.parent)
+        target = next(root.glob(pattern))
+        good = target.read_bytes()
+        target.write_bytes(path.read_bytes())
+        try:
+            read_note(root)
+            return [read_sequence(s) for s in list_sequences(root)]
+        finally:
+            target.write_bytes(good)
+
+    return read
+
+
+@dataclasses.dataclass
+class _State:
+    step: jax.Array
+    weights: jax.Array
+
+
+jax.tree_util.register_dataclass(_State, ["step", "weights"], [])
+
+
+def _state(step):
+    return _State(jnp.int32(step), jnp.arange(6.0))
+
+
+def _checkpoint(folder):
+    """A checkpoint; the good file is the one of its numbers."""
+    root = folder / "checkpoints"
+    if not root.is_dir():
+        kept = Checkpoints(root)
+        kept.save(_state(3))
+        kept.close()
+    return _numbers(root).read_bytes()
+
+
+def _numbers(root):
+    files = [p for p in (root / "3/state").rglob("*") if p.is_file()]
+    return max(files, key=lambda p: (p.stat().st_size, p.name))
+
+
+def _restored(path):
+    root = path.parent / "checkpoints"
+    target = _numbers(root)
+    good = target.read_bytes()
+    target.write_bytes(path.read_bytes())
+    kept = Checkpoints(root)
+    try:
+        return kept.latest(_state(0))
+    finally:
+        kept.close()
+        target.write_bytes(good)
+
+
+def _block(folder):
+    """A block of an unfinished clip."""
+    arrays = {"positions": np.zeros((4, 5, 3, 1), np.float32), "finite": np.ones((4, 1))}
+    Resume(folder / "unfinished", "key").save(0, (jnp.zeros(3), jnp.ones(2)), arrays)
+    return (folder / "unfinished/block_00000.npz").read_bytes()
+
+
+def _resumed(path):
+    folder = path.parent / "unfinished"
+    (folder / "block_00000.npz").write_bytes(path.read_bytes())
+    return list(Resume(folder, "key").blocks((jnp.zeros(3), jnp.ones(2))))
+
+
+# Name: what a good file holds, its ending, its reader, and how many damages the quick tests try.
 READERS = {
-    "bvh": (lambda f: BVH.encode(), ".bvh", read_bvh, 150),
-    "bvh of a person": (lambda f: _SAMPLES["standing_bvh"]().encode(), ".bvh", load_motion, 150),
-    "amc": (lambda f: AMC.encode(), ".amc", _amc, 100),
-    "asf": (lambda f: ASF.encode(), ".asf", _asf, 150),
-    "motion": (_clip, ".npz", load_motion, 100),
-    "obj": (lambda f: OBJ.encode(), ".obj", read_obj, 150),
-    "pc2": (_pc2, ".pc2", read_pc2, 100),
-    "mdd": (_mdd, ".mdd", read_mdd, 100),
-    "scene": (lambda f: SCENE.encode(), ".toml", load_scene, 40),
-    "joint map": (lambda f: NAMES.encode(), ".toml", read_joint_map, 60),
-    "gltf": (_gltf, ".gltf", load_motion, 150),
-    "amass": (_amass, ".npz", load_motion, 100),
-    "character": (_character, ".npz", read_character, 60),
-    "usd": (_usda, ".usda", read_character, 60),
-    "skin": (_skin, ".gltf", read_character, 150),
-    "garment skin": (_skin, ".gltf", read_mesh, 150),
-    "garment usd": (_garment_usda, ".usda", read_mesh, 150),
-    "binary garment usd": (_garment_usdc, ".usdc", read_mesh, 40),
-    "glb": (lambda f: _binary(_gltf(f)), ".glb", load_motion, 150),
-    "garment glb": (lambda f: _binary(_skin(f)), ".glb", read_mesh, 150),
-    "materials": (lambda f: MTL.encode(), ".mtl", _materials, 100),
-    "picture": (_png, ".png", _picture, 60),
-    "ply": (lambda f: PLY, ".ply", read_mesh, 150),
-    "binary ply": (lambda f: _exported("ply"), ".ply", read_mesh, 150),
-    "stl": (lambda f: _exported("stl"), ".stl", read_mesh, 150),
+    "bvh": (lambda f: BVH.encode(), ".bvh", read_bvh, 20),
+    "bvh of a person": (lambda f: _SAMPLES["standing_bvh"]().encode(), ".bvh", load_motion, 20),
+    "amc": (lambda f: AMC.encode(), ".amc", _amc, 20),
+    "asf": (lambda f: ASF.encode(), ".asf", _asf, 20),
+    "motion": (_clip, ".npz", load_motion, 20),
+    "obj": (lambda f: OBJ.encode(), ".obj", read_obj, 20),
+    "pc2": (_pc2, ".pc2", read_pc2, 20),
+    "mdd": (_mdd, ".mdd", read_mdd, 20),
+    "scene": (lambda f: SCENE.encode(), ".toml", load_scene, 20),
+    "joint map": (lambda f: NAMES.encode(), ".toml", read_joint_map, 20),
+    "gltf": (_gltf, ".gltf", load_motion, 20),
+    "amass": (_amass, ".npz", load_motion, 20),
+    "character": (_character, ".npz", read_character, 20),
+    "usd": (_usda, ".usda", read_character, 20),
+    "skin": (_skin, ".gltf", read_character, 20),
+    "garment skin": (_skin, ".gltf", read_mesh, 20),
+    "garment usd": (_garment_usda, ".usda", read_mesh, 20),
+    "binary garment usd": (_garment_usdc, ".usdc", read_mesh, 20),
+    "glb": (lambda f: _binary(_gltf(f)), ".glb", load_motion, 20),
+    "garment glb": (lambda f: _binary(_skin(f)), ".glb", read_mesh, 20),
+    "materials": (lambda f: MTL.encode(), ".mtl", _materials, 20),
+    "picture": (_png, ".png", _picture, 20),
+    "ply": (lambda f: PLY, ".ply", read_mesh, 20),
+    "binary ply": (lambda f: _exported("ply"), ".ply", read_mesh, 20),
+    "stl": (lambda f: _exported("stl"), ".stl", read_mesh, 20),
     "card": (_weights("card.json"), ".json", _card, 20),
     "tensors": (_weights("weights.safetensors"), ".safetensors", _tensors, 12),
+    "actions": (lambda f: ACTIONS, ".csv", _protocol("ACTIONS.csv"), 20),
+    "clips": (lambda f: CLIPS, ".csv", _protocol("CLIPS.csv"), 20),
+    "dataset note": (_stored("*.json"), ".json", _dataset_with("*.json"), 20),
+    "dataset action": (_stored("walk/*.json"), ".json", _dataset_with("walk/*.json"), 20),
+    "dataset motion": (_stored("walk/*.npz"), ".npz", _dataset_with("walk/*.npz"), 20),
+    "dataset garment": (_stored("garments/*.npz"), ".npz", _dataset_with("garments/*.npz"), 20),
+    "dataset array": (_stored("walk/top/c/0/0/0"), ".bin", _dataset_with("walk/top/c/0/0/0"), 20),
+    "dataset description": (
+        *(_stored("walk/top/zarr.json"), ".json"),
+        *(_dataset_with("walk/top/zarr.json"), 20),
+    ),
+    "checkpoint": (_checkpoint, ".bin", _restored, 5),
+    "resume block": (_block, ".npz", _resumed, 20),
 }
 NASTY = (
     b'-1 999999999999 1e999 nan inf 0 \xff\xfe \x00 {{{{ }} \n\n .. ../../x / [ ] " 1e308'
@@ -342,95 +472,9 @@ def tried(name: str, folder: pathlib.Path, blob: bytes) -> bool:
     finally:
         new = {p.name for p in folder.iterdir()} - before
         # What the readers above have put beside it.
-        beside = {"file.asf", "a.amc", "a.obj", "a.mtl", "weights"}
+        beside = {"file.asf", "a.amc", "a.obj", "a.mtl", "weights", "protocol"}
         assert new <= beside, "a reader has written something"
     return True
-
-
-@pytest.mark.release
-@pytest.mark.parametrize("name", READERS)
-def test_damaged_files_are_read_or_refused(name, tmp_path):
-    make, _, _, count = READERS[name]
-    blob = make(tmp_path)
-    assert tried(name, tmp_path, blob), "the file that is damaged below is good"
-
-    @settings(max_examples=count, deadline=None, suppress_health_check=list(HealthCheck))
-    @given(seed=st.integers(0, 2**32))
-    def all_seeds(seed):
-        tried(name, tmp_path, damaged(blob, seed))
-
-    all_seeds()
-
-
-HUGE = {
-    "bvh": BVH.replace("Frames: 2", "Frames: 1000000000").encode(),
-    "obj": OBJ.replace("f 2 4 3", "f 2 4 999999999").encode(),
-    "ply": PLY.replace(b"vertex 4", b"vertex 999999999"),
-    "binary ply": PLY.replace(b"ascii", b"binary_little_endian").replace(
-        b"vertex 4", b"vertex 999999999"
-    ),
-    "stl": b"\0" * 80 + np.array([10**9], "<u4").tobytes() + b"\0" * 100,
-    "pc2": b"POINTCACHE2\0" + np.array([1, 10**9], "<i4").tobytes() + b"\0" * 12,
-    "mdd": np.array([10**9, 10**9], ">i4").tobytes() + b"\0" * 64,
-}
-
-
-@pytest.mark.parametrize("name", HUGE)
-def test_huge_numbers_in_small_files_take_no_memory(name, tmp_path):
-    tracemalloc.start()
-    assert not tried(name, tmp_path, HUGE[name])
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 50e6
-
-
-def test_frames_times_joints_are_bounded(tmp_path):
-    """Little text on either side of the product, none of it wrong."""
-    document = json.loads(_gltf(tmp_path))
-    blob = np.array([0, 9e8, 0, 1, 0, 0, 1.1, 0], "<f4").tobytes()
-    document["buffers"][0]["uri"] = "data:;base64," + base64.b64encode(blob).decode()
-    (tmp_path / "long.gltf").write_text(json.dumps(document))
-    joints = "".join(f"JOINT j{k}\n{{\nOFFSET 0 1 0\nCHANNELS 0\n}}\n" for k in range(3000))
-    head = BVH[: BVH.index("JOINT Knee")] + joints + "}\nMOTION\nFrames: 20000\nFrame Time: 0.01\n"
-    (tmp_path / "wide.bvh").write_text(head + "0 1 0 0 0 0\n" * 20000)
-    for name in ("long.gltf", "wide.bvh"):
-        tracemalloc.start()
-        with pytest.raises(PhysXNetError, match=name):
-            load_motion(tmp_path / name)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        assert peak < 50e6
-
-
-def test_oversized_archive_headers_take_no_memory(tmp_path):
-    import io
-    import zipfile
-
-    header = io.BytesIO()
-    fields = {"descr": "<f4", "fortran_order": False, "shape": (10**9, 31, 4)}
-    np.lib.format.write_array_header_1_0(header, fields)
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
-        file.writestr("rotations.npy", header.getvalue() + b"\0" * 64)
-        file.writestr("root.npy", header.getvalue())
-    tracemalloc.start()
-    with pytest.raises(PhysXNetError, match="announces"):
-        load_motion(tmp_path / "a.npz")
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 50e6
-
-
-def test_objects_are_never_unpickled(tmp_path):
-    class Trap:
-        def __reduce__(self):
-            return (pathlib.Path(tmp_path / "sprung").touch, ())
-
-    trap = np.empty(1, object)
-    trap[0] = Trap()
-    np.savez(tmp_path / "a.npz", rotations=trap, root=trap, fps=trap, allow_pickle=True)
-    with pytest.raises(PhysXNetError, match="objects"):
-        load_motion(tmp_path / "a.npz")
-    assert not (tmp_path / "sprung").exists()
 
 
 def main(seconds: float) -> None:
