@@ -128,8 +128,9 @@ def write_html(path: str | pathlib.Path, meshes: Sequence[AnimatedMesh], fps: fl
     """Writes a self-contained HTML page that plays the clip in any browser.
 
     The page needs no network, and its content policy allows none. The mouse orbits the camera,
-    playback can be paused and scrubbed, and every mesh can be hidden. The address ``page.html#frame=12&without=top`` opens the page
-    at a frame, without a mesh. The limits of `write_gltf` apply.
+    playback can be paused and scrubbed, and every mesh can be hidden. The address
+    ``page.html#frame=12&without=top`` opens the page at a frame, without a mesh. The limits
+    of `write_gltf` apply.
 
     Args:
         path: ``.html``; written atomically.
