@@ -245,12 +245,11 @@ def animation_blocks(
     frames = motion.num_frames
     place = ground_point(motion)
     motion = motion.moved(-place)
-    pick = np.minimum(np.arange(-(-frames // _BLOCK) * _BLOCK), frames - 1)
-    rotations = np.asarray(motion.rotations)[pick].reshape(-1, _BLOCK, *motion.rotations.shape[1:])
-    root = np.asarray(motion.root)[pick].reshape(-1, _BLOCK, 3)
-    for k, (q, p) in enumerate(zip(rotations, root, strict=True)):
-        block = np.asarray(_animate_block(body, rest, vertices, weights, q, p))
-        block = block[: frames - k * _BLOCK]
+    rotations, root = np.asarray(motion.rotations), np.asarray(motion.root)
+    for start in range(0, frames, _BLOCK):
+        rows = np.minimum(np.arange(start, start + _BLOCK), frames - 1)
+        block = _animate_block(body, rest, vertices, weights, rotations[rows], root[rows])
+        block = np.asarray(block)[: frames - start]
         yield block + place if place.any() else block
 
 

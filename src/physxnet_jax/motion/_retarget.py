@@ -91,7 +91,7 @@ def retarget(
         rows = slice(at, at + len(world))
         root[rows] = scale * part.positions()[:, hips].mean(axis=1) - world[:, 0] @ middle
         quaternions[rows] = _local_quaternions(body, world)
-    quaternions = continuous(quaternions)
+    continuous(quaternions)
     if start:
         quaternions, root = _without_t_pose_blend(quaternions, root, source.fps)
     motion = make_motion(quaternions, root, source.fps, name=source.name)
@@ -248,8 +248,7 @@ def _local_quaternions(
 def continuous(
     q: Float[np.ndarray, "frames joints 4"],
 ) -> Float[np.ndarray, "frames joints 4"]:
-    """Flips signs so that successive quaternions are near each other."""
-    flips = np.sign(np.einsum("fjc,fjc->fj", q[1:], q[:-1]))[..., None]
-    out = q.copy()
-    out[1:] *= np.cumprod(np.where(flips == 0, 1.0, flips), axis=0)
-    return out
+    """Flips signs in place so that successive quaternions are near each other; returns them."""
+    apart = np.einsum("fjc,fjc->fj", q[1:], q[:-1]) < 0.0
+    q[1:][np.logical_xor.accumulate(apart, axis=0)] *= -1.0
+    return q
