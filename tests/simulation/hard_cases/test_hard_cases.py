@@ -20,7 +20,14 @@ from physxnet_jax.simulation import (
     settle_on_static_body,
     standard_effects,
 )
-from physxnet_jax.simulation.effects import BodyContact, LayerContact, Pin, Stretch
+from physxnet_jax.simulation.effects import (
+    BodyContact,
+    LayerContact,
+    Pin,
+    Stretch,
+    _hinge,
+    _membrane,
+)
 
 release = pytest.mark.release
 
@@ -105,6 +112,15 @@ def test_findings_fail_above_the_bound_and_for_nan():
     assert Finding("x", "y", 1.0, 1.0).holds
     assert not Finding("x", "y", 1.0, 1.1).holds
     assert not Finding("x", "y", 1.0, float("nan")).holds
+
+
+@pytest.mark.release
+def test_slivers_are_thrown_about_without_their_guard(monkeypatch):
+    """The control for the degenerate mesh: every triangle counts as sound."""
+    for module in (_membrane, _hinge):
+        monkeypatch.setattr(module, "sound", lambda x, faces: np.ones(len(faces), bool))
+    broken = {f.quantity for f in run_case("degenerate_mesh") if not f.holds}
+    assert broken == {"greatest speed (m/s)"}
 
 
 def test_explicit_solver_explodes_on_a_stiff_sheet():
