@@ -5,6 +5,7 @@ import errno
 import os
 import pathlib
 import shutil
+import signal
 import subprocess
 import sys
 
@@ -286,3 +287,28 @@ def test_long_work_is_refused_where_another_process_is_at_it(tmp_path):
             with pytest.raises(BusyError, match=f"there: in use by process {os.getpid()}"):
                 work()
     assert not there.exists()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signals_wait_for_the_end_and_act_then(number):
+    reached = []
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    before = signal.signal(number, stop)
+    try:
+        with pytest.raises(KeyboardInterrupt), files.uninterrupted():
+            signal.raise_signal(number)
+            reached.append("held")
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(number)
+            reached.append("open")
+        # What fails by itself says so.
+        with pytest.raises(ZeroDivisionError), files.uninterrupted():
+            signal.raise_signal(number)
+            1 / 0  # noqa: B018
+        assert signal.getsignal(number) is stop
+    finally:
+        signal.signal(number, before)
+    assert reached == ["held"]

@@ -12,6 +12,7 @@ import pathlib
 import platform
 import re
 import shutil
+import signal
 import tempfile
 import threading
 import zipfile
@@ -225,6 +226,27 @@ def _lock(file: int, wait: bool) -> None:
         except OSError as error:
             if error.errno not in (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP):
                 raise
+
+
+@contextlib.contextmanager
+def uninterrupted() -> Iterator[None]:
+    """Within it Ctrl-C and SIGTERM wait; they act at its end, unless an error ends it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    caught: list[int] = []
+    before = {s: signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)}
+    # Another language's handler can't be put back.
+    known = {s: handler for s, handler in before.items() if handler is not None}
+    for s in known:
+        signal.signal(s, lambda number, _: caught.append(number))
+    try:
+        yield
+    finally:
+        for s, handler in known.items():
+            signal.signal(s, handler)
+    for number in caught[:1]:
+        signal.raise_signal(number)
 
 
 def json_text(values: object) -> str:

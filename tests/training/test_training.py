@@ -4,6 +4,7 @@ import dataclasses
 import inspect
 import json
 import math
+import signal
 
 import jax
 import jax.numpy as jnp
@@ -354,6 +355,24 @@ def test_interrupted_run_has_the_validation_of_an_uninterrupted_one(tmp_path):
     other = [data[1], dataclasses.replace(sequence(seed=2), name="a")]
     with pytest.raises(PhysXNetError, match="another data"):
         train(config, other, tmp_path / "parts")
+
+
+def test_an_interrupt_waits_for_the_checkpoint(tmp_path, monkeypatch):
+    state = TrainState(**{f.name: jnp.zeros(()) for f in dataclasses.fields(TrainState)})
+    kept = Checkpoints(tmp_path / "kept")
+    save = kept._manager.save
+
+    def interrupted(*args, **options):
+        signal.raise_signal(signal.SIGINT)
+        return save(*args, **options)
+
+    monkeypatch.setattr(kept._manager, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        kept.save(dataclasses.replace(state, step=jnp.int32(3)))
+    kept.close()
+    again = Checkpoints(tmp_path / "kept")
+    assert int(again.latest(state).step) == 3
+    again.close()
 
 
 def test_checkpoints_after_the_resumed_step_are_deleted(tmp_path):

@@ -9,6 +9,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from ..errors import PhysXNetError
+from ..files import uninterrupted
 
 
 @runtime_checkable
@@ -40,18 +41,19 @@ class Checkpoints:
         )
 
     def save(self, state: Stepped) -> None:
-        """Saves a state under its step number, atomically.
+        """Saves a state under its step number, atomically; Ctrl-C waits for that.
 
         Raises:
             PhysXNetError: A later checkpoint exists.
         """
         if self._manager.latest_step() == int(state.step):
             return
-        saved = self._manager.save(
-            int(state.step),
-            args=ocp.args.Composite(state=ocp.args.StandardSave(_plain(state))),
-        )
-        self._manager.wait_until_finished()
+        with uninterrupted():
+            saved = self._manager.save(
+                int(state.step),
+                args=ocp.args.Composite(state=ocp.args.StandardSave(_plain(state))),
+            )
+            self._manager.wait_until_finished()
         if not saved:
             raise PhysXNetError(
                 f"{self._manager.directory}: step {int(state.step)} wasn't saved, because step"
