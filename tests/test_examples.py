@@ -35,6 +35,9 @@ def test_examples_run(path, tmp_path):
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert f"python examples/{path.name}" in path.read_text()
+    assert re.search(r"\d+ s in all", done.stdout)
+    (picture,) = re.findall(r"wrote (out/\w+\.png)", done.stdout)
+    assert (tmp_path / picture).stat().st_size > 10_000
     if path.name.startswith("04"):
         found = float(re.search(r"found ([\d.]+) rad", done.stdout).group(1))
         assert found == pytest.approx(0.6, abs=0.02)

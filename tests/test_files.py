@@ -120,7 +120,7 @@ def test_a_full_disk_is_named(tmp_path, monkeypatch, clip):
         fail()
     assert path.read_text() == "old" and not parts(tmp_path)
     # Before the work, where the size is known.
-    with pytest.raises(DiskFullError, match="it will have about 120 MB, but 0 MB are free"):
+    with pytest.raises(DiskFullError, match="about 120 MB are needed, but 0 MB are free"):
         check_output(tmp_path / "a.pc2", 1000, 10_000)
     check_output(tmp_path / "a.pc2")
     monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=100))

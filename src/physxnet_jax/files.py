@@ -333,7 +333,7 @@ def check_writable(path: str | pathlib.Path, size: int = 0) -> None:
         ) from None
     if free < size:
         raise DiskFullError(
-            f"{path}: it will have about {size / 1e6:.0f} MB, but {free / 1e6:.0f} MB are free."
+            f"{path}: about {size / 1e6:.0f} MB are needed, but {free / 1e6:.0f} MB are free."
             " Free some space, choose another disk or fewer --frames."
         )
 

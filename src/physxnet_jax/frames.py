@@ -2,8 +2,10 @@
 
 import contextlib
 import contextvars
+import errno
 import math
 import mmap
+import os
 import pathlib
 import shutil
 import tempfile
@@ -82,7 +84,8 @@ class FrameStore:
             raise ValueError(f"{self.count + len(block)} frames, announced were {self.frames}")
         if self._file is not None:
             # Not by way of a mapping: a full disk would end the process.
-            self._file.write(np.ascontiguousarray(block).data)
+            with _on_a_full_disk():
+                self._file.write(np.ascontiguousarray(block).data)
         elif self._array is not None:
             self._array[self.count : self.count + len(block)] = block
         self.count += len(block)
@@ -96,7 +99,8 @@ class FrameStore:
         if self._frame is None or self.count < self.frames:
             raise ValueError(f"{self.count} frames, announced were {self.frames}")
         if self._array is None:
-            self._file.flush()
+            with _on_a_full_disk():
+                self._file.flush()
             shape = (self.count, *self._frame.shape[1:])
             self._array = np.asarray(np.memmap(self._file, self._frame.dtype, "r", shape=shape))
             # The mapping keeps the file.
@@ -113,7 +117,27 @@ def _scratch_file(size: int) -> Any:
             f"{folder}: {size / 1e6:.0f} MB are needed for frames that don't fit in memory, but"
             f" {free / 1e6:.0f} MB are free. Free some space, choose another disk or fewer frames."
         )
-    return tempfile.TemporaryFile(dir=folder)
+    file = tempfile.TemporaryFile(dir=folder)
+    if hasattr(os, "posix_fallocate"):
+        try:
+            # Taken at once: others write to the disk as well.
+            os.posix_fallocate(file.fileno(), 0, size)
+        except OSError as error:
+            if error.errno == errno.ENOSPC:
+                file.close()
+                raise DiskFullError(f"{folder}: {size / 1e6:.0f} MB don't fit on it.") from error
+    return file
+
+
+@contextlib.contextmanager
+def _on_a_full_disk() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise DiskFullError(
+            f"frames that don't fit in memory can't be kept ({error.strerror}). Free some space,"
+            " choose another disk or fewer frames."
+        ) from error
 
 
 def in_chunks(
@@ -133,6 +157,9 @@ def in_chunks(
 
 def _forget(array: np.ndarray) -> None:
     """Gives up the memory of an array's file; it is read again when it is used."""
+    if array.flags.writeable:
+        # It may have been changed in memory alone.
+        return
     base: Any = array
     while isinstance(base, np.ndarray):
         base = base.base

@@ -149,7 +149,12 @@ def test_command_list_shows_no_examples(capsys):
     assert "Examples" not in said and all(f" {name} " in said for name in _COMMANDS)
 
 
-def test_interrupts_report_saved_results_and_debug_shows_the_traceback(monkeypatch, capsys):
+def test_interrupts_report_saved_results_and_debug_shows_the_traceback(
+    monkeypatch, capsys, tmp_path
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / ".begun.npz.unfinished").mkdir()
+
     def stopped(*_):
         raise KeyboardInterrupt
 
@@ -159,8 +164,10 @@ def test_interrupts_report_saved_results_and_debug_shows_the_traceback(monkeypat
         assert "nothing half-written" in capsys.readouterr().err
         for words, kept in (
             (["simulate", "walk"], False),
-            (["simulate", "walk", "-o", "a.npz"], True),
-            (["simulate", "walk", "-o", "a.npz", "--engine", "blender"], False),
+            (["simulate", "walk", "-o", "begun.npz"], True),
+            (["dress", "walk", "-o", "begun.npz"], True),
+            # Nothing was computed yet, or all of it is written.
+            (["simulate", "walk", "-o", "a.npz"], False),
             (["evaluate", "lbs", "--data", "a"], False),
             (["evaluate", "lbs", "--data", "a", "--out", "a.json"], True),
             (["bench", "net", "--out", "a.json"], True),

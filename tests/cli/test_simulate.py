@@ -44,6 +44,7 @@ from physxnet_jax.simulation.blender import find_blender
 from physxnet_jax.simulation.effects import (
     Air,
     BodyContact,
+    Damping,
     Floor,
     Gravity,
     LayerContact,
@@ -364,6 +365,18 @@ def test_effects_command_prints_and_writes_its_table(tmp_path, capsys, monkeypat
     assert data[0]["jitter_mm"] == data[2]["jitter_mm"] > 0
 
 
+@pytest.mark.release
+def test_an_idle_effect_costs_nothing_and_shifts_no_other():
+    sheet = square_sheet(5, 0.2)
+    motion = dataclasses.replace(load_motion("walk", fps=30.0)[:3], name="walk")
+    effects = (Damping(rate=0.0), Gravity(), Stretch())
+    rows = price_effects(Scene((sheet,), effects), motion, solver=XPBD(4, 1))
+    found = {r.without: r.max_mm for r in rows}
+    assert found["Damping"] == 0.0
+    # A third of a second of free fall goes with gravity, and nothing else does.
+    assert found["Gravity"] > 20.0 > 5.0 > found["Stretch"]
+
+
 @pytest.mark.nightly
 def test_recommended_scene_is_written_and_simulated(tmp_path, capsys):
     needed = tmp_path / "needed.toml"
@@ -412,18 +425,25 @@ def test_rollout_fingerprint_is_equal_across_processes():
         "from physxnet_jax.simulation._resume import fingerprint\n"
         "from physxnet_jax.garment import square_sheet\n"
         "pad = [object() for _ in range({pad})]\n"
+        "if {network}:\n"
+        "    import physxnet_jax as px\n"
+        "    print(fingerprint(px.make_dresser(['shorts'], inference=px.Inference(weights='nano'))))\n"
+        "    raise SystemExit\n"
         "scene = prepare_scene(Scene((square_sheet(12, 0.5),)))\n"
         "print(fingerprint(scene, (XPBD({steps}, 2), True)))\n"
     )
 
-    def name(pad, steps=8):
-        words = [sys.executable, "-c", code.format(pad=pad, steps=steps)]
+    def name(pad, steps=8, network=False):
+        text = code.format(pad=pad, steps=steps, network=network)
+        words = [sys.executable, "-c", text]
         return subprocess.run(words, capture_output=True, text=True, check=True).stdout.split()[-1]
 
     first = name(0)
     assert len(first) == 64 and name(100_000) == first
     # The control: another setting is another rollout.
     assert name(0, steps=16) != first
+    # A network's structure names functions.
+    assert name(0, network=True) == name(100_000, network=True) != first
 
 
 def test_loaded_motion_stands_on_the_floor_for_other_shapes(body):

@@ -143,6 +143,7 @@ print(held("VmHWM") - before)
 
 
 @pytest.mark.release
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("case", CASES)
 def test_small_files_take_little_memory(case, tmp_path, promise):
     make, suffix, name = CASES[case]

@@ -30,6 +30,15 @@ def test_strays_change_neither_unit_nor_place(where, count, tmp_path, monkeypatc
     assert np.abs(np.asarray(mistaken.mesh.vertices)[: len(x)] - x).max() > 0.1
 
 
+@pytest.mark.parametrize(("vertices", "count"), [(40, 1), (100, 3), (260, 3)])
+def test_strays_of_coarse_meshes_are_found(vertices, count):
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-0.3, 0.3, size=(vertices, 3))
+    x[:count] += [5.0, 0.0, 0.0]
+    np.testing.assert_array_equal(_search.strays(x), np.arange(vertices) < count)
+    assert not _search.strays(x[count:]).any()
+
+
 def test_no_ordinary_garment_has_strays():
     for kind in ("top", "bottom", "dress"):
         assert not _search.strays(np.asarray(template(kind).mesh.vertices)).any()

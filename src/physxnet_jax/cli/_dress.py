@@ -24,7 +24,8 @@ from ..dressing import (
     write_dressed_character,
 )
 from ..errors import FormatError, OutOfMemoryError, PhysXNetError
-from ..frames import scratch_folder
+from ..files import check_writable
+from ..frames import IN_MEMORY, scratch_folder
 from ..io import check_output, write_clip
 from ..models import read_card
 from ..motion import Motion, load_motion
@@ -76,13 +77,14 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
     _check_files(output.out, pictures, command.picture, console)
     with progress_bars(console, lines=command.terminal.progress) as progress:
         selected = choose(command, progress)
-        resume = _unfinished(output)
         options: dict[str, Any] = {
             "method": command.method,
             "inference": command.inference.build(),
-            "simulation": dataclasses.replace(command.simulation.build(), resume=resume),
+            "simulation": command.simulation.build(),
         }
         options |= {} if selected is None else selected.profile.options
+        resumed = dataclasses.replace(options["simulation"], resume=output.unfinished)
+        options["simulation"] = resumed
         job = _job(
             command.motion, command.source, command.outfit, command.person, options, progress
         )
@@ -113,7 +115,7 @@ def run_simulate(command: Simulate, console: Console) -> int:
             job = _job(
                 command.scene, command.source, command.outfit, command.person, options, progress
             )
-        simulation = dataclasses.replace(job.simulation, resume=_unfinished(output))
+        simulation = dataclasses.replace(job.simulation, resume=output.unfinished)
         job = dataclasses.replace(job, simulation=simulation)
         clip, written, seconds = _run(job, output, pictures, command.picture, progress)
     if command.terminal.json:
@@ -123,12 +125,6 @@ def run_simulate(command: Simulate, console: Console) -> int:
     console.print(rollout_table(clip, job.simulation, seconds))
     _print_end(clip, (*job.notes, *_lost(job, output)), written, console)
     return _code(output, clip)
-
-
-def _unfinished(output: Output) -> pathlib.Path | None:
-    """Folder of finished blocks, beside what they will become."""
-    first = output.out or output.preview
-    return None if first is None else first.with_name(f".{first.name}.unfinished")
 
 
 def _code(output: Output, clip: DressedClip) -> int:
@@ -263,10 +259,16 @@ def _run(
     def check_size(frames: int, vertices: dict[str, int]) -> None:
         release_programs()
         if out is not None:
-            # There the built-in body is a skeleton with a skin.
-            skinned = out.suffix.lower().startswith(".usd") and isinstance(job.motion, Motion)
+            # There the built-in body is a skeleton with a skin; a rig is copied.
+            if isinstance(job.motion, Motion):
+                skinned = out.suffix.lower().startswith(".usd")
+            else:
+                skinned = _keeps_rig(job.motion, output)
             written = sum(n for k, n in vertices.items() if not (skinned and k == "body"))
             check_output(out, frames, written)
+            # What is larger than memory is on the disk twice more until it is written.
+            kept = sum(12 * frames * n for n in vertices.values() if 12 * frames * n > IN_MEMORY)
+            check_writable(out, 2 * kept)
 
     motion = job.motion if isinstance(job.motion, Motion) else job.motion.motion
     if out is not None:
@@ -300,11 +302,7 @@ def _run(
     files: list[Stage] = []
     ticks = time.perf_counter()
     if out is not None:
-        person = job.motion
-        if isinstance(person, Character) and _keeps_rig(person, output):
-            written.append(write_dressed_character(out, person, clip.garments))
-        else:
-            written += _write(out, clip, output.velocities)
+        written += _write(out, job.motion, clip, output)
         files.append(Stage("writing", 1e3 * (time.perf_counter() - ticks)))
     for picture in pictures:
         ticks = time.perf_counter()
@@ -314,9 +312,13 @@ def _run(
     return dataclasses.replace(clip, stages=(*job.stages, *clip.stages, *files)), written, seconds
 
 
-def _write(out: pathlib.Path, clip: DressedClip, velocities: bool) -> list[pathlib.Path]:
+def _write(
+    out: pathlib.Path, person: Motion | Character, clip: DressedClip, output: Output
+) -> list[pathlib.Path]:
     try:
-        return write_clip(out, clip.meshes, clip.fps, velocities=velocities)
+        if isinstance(person, Character) and _keeps_rig(person, output):
+            return [write_dressed_character(out, person, clip.garments)]
+        return write_clip(out, clip.meshes, clip.fps, velocities=output.velocities)
     except MemoryError as error:
         # An archive is written by parts.
         kept = out.with_name(f"{out.stem}.kept.npz")

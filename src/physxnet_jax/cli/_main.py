@@ -190,8 +190,8 @@ def _flag(command: Any, name: str) -> bool:
 def _resumes(command: object) -> bool:
     """Whether an interrupted command resumes on its next run."""
     if isinstance(command, Dress | Simulate):
-        internal = command.simulation.engine in ("xpbd", "bdf2")
-        return internal and (command.output.out or command.output.preview) is not None
+        folder = command.output.unfinished
+        return folder is not None and folder.is_dir()
     if isinstance(command, Evaluate | Bench):
         return command.out is not None and not command.times
     if isinstance(command, Dataset):

@@ -165,6 +165,12 @@ class Output:
     strict: bool = False
     """Exit with code 1 if a simulated garment slides off the body."""
 
+    @property
+    def unfinished(self) -> pathlib.Path | None:
+        """Folder of finished blocks, beside what they will become."""
+        first = self.out or self.preview
+        return None if first is None else first.with_name(f".{first.name}.unfinished")
+
 
 @dataclasses.dataclass(frozen=True)
 class PreviewOptions:

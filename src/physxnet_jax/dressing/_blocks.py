@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from ..body import Body
 from ..geometry import map_frames
 from ..motion import BLOCK, Motion, clip_transforms, history_transforms, padded_block
-from ..simulation import Resume, fingerprint
+from ..simulation import QUICK, Resume, fingerprint
 from ._dresser import Dresser
 from ._guided import init_guided
 from ._pipeline import infer_block
@@ -93,7 +93,7 @@ def infer_clip(
         dresser: From `make_dresser`.
         clip: From `pose_clip`, on the dresser's body.
         resume: Folder for finished blocks, from which the same call goes on after an interruption;
-            it is removed at the end. Blocks of another call are removed.
+            it is removed at the end. Blocks of another such call are removed.
 
     Yields:
         Blocks of at most `BLOCK` frames, in order.
@@ -112,7 +112,7 @@ def infer_clip(
         )
     store, done = None, 0
     if resume is not None:
-        store = Resume(resume, fingerprint(dresser, r, t, clip.motion.fps), keep=False)
+        store = Resume(resume, QUICK + fingerprint(dresser, r, t, clip.motion.fps))
         for reached, arrays in store.blocks(state):
             state = reached
             yield _stored_block(BLOCK * done, names, arrays)

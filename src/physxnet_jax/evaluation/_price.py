@@ -133,6 +133,7 @@ def _price(
     base = dataclasses.replace(base, jitter_mm=_noise_floor(prepared, motion, solver, whole))
     rows = [base]
     count = len(scene.effects)
+    acting = [e for e in scene.effects if not e.idle(prepared.assembly)]
     for k, e in enumerate(scene.effects):
         # The program before isn't run again.
         advance.clear_cache()  # pyright: ignore[reportAttributeAccessIssue]
@@ -143,7 +144,8 @@ def _price(
             # Held vertices have another mass.
             rest = prepare_scene(dataclasses.replace(scene, effects=others))
         else:
-            kept = tuple(x for i, x in enumerate(prepared.effects) if i != k)
+            pairs = zip(acting, prepared.effects, strict=True)
+            kept = tuple(p for x, p in pairs if x is not e)
             rest = dataclasses.replace(prepared, effects=kept)
         row, _ = _measure(rest, motion, solver, whole, type(e).__name__)
         rows.append(dataclasses.replace(row, jitter_mm=base.jitter_mm))

@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -43,8 +44,8 @@ _GOOD = 0.018
 # A garment that is held lies this near the skin [m], with that share of it; and is inside with
 # less than this share [1].
 _CONTACT, _HELD, _INSIDE = 0.03, 0.03, 0.05
-# Share of vertices on either side that may be strays.
-_ODD = 0.002
+# Share of vertices on either side that may be strays, and their number in a coarse mesh.
+_ODD, _FEW = 0.002, 3
 _COARSE, _FINE, _GRID, _BEST = 160, 800, 0.05, 8
 _POSES = ("rest", "T-pose")
 
@@ -166,7 +167,9 @@ def strays(vertices: Float[np.ndarray, "vertices 3"]) -> Bool[np.ndarray, " vert
 
     A vertex left behind in another corner of a scene would be most of a garment's size.
     """
-    low, high = np.quantile(vertices, [_ODD, 1.0 - _ODD], axis=0)
+    few = min(max(_FEW, math.ceil(_ODD * len(vertices))), len(vertices) // 8)
+    ordered = np.sort(vertices, axis=0)
+    low, high = ordered[few], ordered[len(vertices) - 1 - few]
     margin = float((high - low).max())
     return ((vertices < low - margin) | (vertices > high + margin)).any(axis=1)
 

@@ -17,7 +17,7 @@ from ._effect import (
 from ._implicit import Implicit as Implicit
 from ._potential import incremental_potential as incremental_potential
 from ._prepared_scene import PreparedScene as PreparedScene
-from ._resume import Resume as Resume, fingerprint as fingerprint
+from ._resume import QUICK as QUICK, Resume as Resume, fingerprint as fingerprint
 from ._rollout import (
     PRESETS as PRESETS,
     ROLLOUT_BLOCK as ROLLOUT_BLOCK,
