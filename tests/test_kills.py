@@ -177,7 +177,13 @@ def dying(self, target):
     return done
 pathlib.Path.replace = dying
 """
-MAIN = "import sys\nfrom physxnet_jax.cli import main\nsys.exit(main())\n"
+# Started in the background, a process would ignore Ctrl-C.
+MAIN = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from physxnet_jax.cli import main
+sys.exit(main())
+"""
 
 
 def started(folder, words, before="", *more):
