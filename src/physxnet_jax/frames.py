@@ -10,7 +10,7 @@ import pathlib
 import shutil
 import tempfile
 import weakref
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -173,7 +173,14 @@ def moved_frames(
     """Positions displaced [m]; the same array if that is zero."""
     if not by.any():
         return positions
-    store = FrameStore(len(positions))
-    for x in in_chunks(positions):
-        store.append(x + by)
+    return all_frames(len(positions), (x + by for x in in_chunks(positions)))
+
+
+def all_frames(
+    frames: int, blocks: Iterable[Float[np.ndarray, "some vertices 3"]]
+) -> Float[np.ndarray, "frames vertices 3"]:
+    """Blocks in one array, by way of a `FrameStore`."""
+    store = FrameStore(frames)
+    for block in blocks:
+        store.append(block)
     return store.array()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from physxnet_jax._environment import check_jaxlib, jaxlib_problem
-from physxnet_jax.cli import main
+from physxnet_jax.cli import _dress, main
 from physxnet_jax.cli._commands import Dress, Export, View
 from physxnet_jax.cli._main import _COMMANDS, parse
 from physxnet_jax.dressing import Inference, dress
@@ -176,6 +176,50 @@ def test_interrupts_report_saved_results_and_debug_shows_the_traceback(
             assert ("kept for the next run" in capsys.readouterr().err) == kept, words
     with pytest.raises(PhysXNetError, match="built-in clip"):
         main(["dress", "wlak", "--debug"])
+
+
+def test_memory_that_ends_is_one_sentence(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / ".begun.npz.unfinished").mkdir()
+    numpys = "Unable to allocate 8.2 GiB for an array with shape (1, 2)"
+    for error, said in (
+        (MemoryError(numpys), numpys),
+        (MemoryError(), "memory ended: MemoryError."),
+        (RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes.\nmore"), "9 bytes."),
+    ):
+
+        def ended(*_, error=error):
+            raise error
+
+        with monkeypatch.context() as patched:
+            patched.setattr("physxnet_jax.cli._main._run", ended)
+            assert main(["dress", "walk", "-o", "begun.npz"]) == 2
+        found = capsys.readouterr().err
+        assert said in found and "kept for the next run" in found and "--frames" in found
+
+    def failed(*_):
+        raise RuntimeError("something else")
+
+    monkeypatch.setattr("physxnet_jax.cli._main._run", failed)
+    with pytest.raises(RuntimeError, match="something else"):
+        main(["dress", "walk"])
+
+
+def test_a_clip_that_cannot_be_written_for_memory_is_kept(monkeypatch, capsys, tmp_path):
+    write = _dress.write_clip
+
+    def ended(path, *args, **options):
+        if path.suffix == ".glb":
+            raise MemoryError("12 GB")
+        return write(path, *args, **options)
+
+    monkeypatch.setattr(_dress, "write_clip", ended)
+    words = ["dress", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "2"]
+    assert main([*words, "-o", str(tmp_path / "a.glb")]) == 2
+    assert "12 GB" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.iterdir()] == ["a.kept.npz"]
+    with np.load(tmp_path / "a.kept.npz") as file:
+        assert len(file["bottom_positions"]) == 2
 
 
 def test_shell_completion_covers_all_commands(capsys):

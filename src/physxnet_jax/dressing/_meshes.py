@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import re
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from ..body import NUM_BODY_VERTICES, Body
 from ..errors import PhysXNetError
-from ..frames import FrameStore
+from ..frames import all_frames
 from ..garment import Garment, load_outfit
 from ..io import AnimatedMesh, Skinning
 from ..motion import Motion, body_blocks, clip_transforms
@@ -55,7 +55,7 @@ def animated_meshes(
         meshes.append(
             AnimatedMesh(
                 "body",
-                _all_frames(clip.num_frames, body_blocks(body, clip, shape)),
+                all_frames(clip.num_frames, body_blocks(body, clip, shape)),
                 np.asarray(mesh.faces),
                 np.asarray(mesh.uv),
                 np.asarray(mesh.uv_faces),
@@ -73,13 +73,6 @@ def animated_meshes(
             AnimatedMesh(g.name, positions[g.name], faces, uv, uv_faces, colour, g.polygons)
         )
     return tuple(meshes)
-
-
-def _all_frames(frames: int, blocks: Iterable[np.ndarray]) -> np.ndarray:
-    store = FrameStore(frames)
-    for block in blocks:
-        store.append(block)
-    return store.array()
 
 
 def _skinning(body: Body, clip: Motion, shape: Any | None) -> Skinning:
