@@ -14,6 +14,7 @@ Result:  experiments/results/guided.json and .md.
 """
 
 import argparse
+import dataclasses
 import json
 import math
 import pathlib
@@ -37,16 +38,7 @@ from physxnet_jax.dressing import (
     make_dresser,
     pose_clip,
 )
-from physxnet_jax.evaluation import (
-    edge_strain,
-    fold_spectrum,
-    fold_strength,
-    jitter,
-    machine,
-    skinning,
-    spectrum_distance,
-    wrinkle_error,
-)
+from physxnet_jax.evaluation import likeness, machine, skinning
 from physxnet_jax.files import atomic_write, write_json
 from physxnet_jax.garment import DEFAULT_KINDS, tailor
 from physxnet_jax.models import load_predictor
@@ -60,8 +52,6 @@ SUBSTEPS = (4, 8, 16, 32)
 # A guide that doesn't pull.
 NEVER = 1e6
 RATES = (24.0, 60.0, 120.0)
-# Every so manieth frame is looked at for the spectrum.
-STRIDE = 15
 TIMED = 60
 
 
@@ -99,28 +89,18 @@ def steps(data: str, weights: Any, action: str, template: str) -> Iterator[dict]
     s = worn_alone(data, template, action)
     worn, motion = s.clothing(template), s.motion
     garment = garment_of(worn)
-    faces = np.asarray(garment.mesh.faces)
-    assembly = prepare_scene(Scene((garment,), standard_effects((garment,)), None, shape_of(worn)))
-    assembly = assembly.assembly
+    scene = prepare_scene(Scene((garment,), standard_effects((garment,)), None, shape_of(worn)))
     skinned = skinning()(motion, worn).positions
     truth = skinned + s.offsets[template]
-    spectrum = fold_spectrum(assembly.rest, faces, truth[::STRIDE])
-    tension = np.quantile(edge_strain(assembly, truth), 0.99)
 
     def row(method: str, substeps: int, x: np.ndarray) -> dict:
-        found = fold_spectrum(assembly.rest, faces, x[::STRIDE])
         return {
             "part": "steps",
             "template": template,
             "action": action,
             "method": method,
             "substeps": substeps,
-            "rmse_mm": error(x, truth),
-            "folds": fold_strength(faces, x) / fold_strength(faces, truth),
-            "wrinkle_deg": wrinkle_error(faces, x, truth),
-            "spectrum": spectrum_distance(found, spectrum),
-            "tension": float(np.quantile(edge_strain(assembly, x), 0.99) / tension),
-            "jerk": jitter(x, motion.fps) / jitter(truth, motion.fps),
+            **dataclasses.asdict(likeness(scene.assembly, x, truth, fps=motion.fps)),
         }
 
     yield row("skinning", 0, skinned)

@@ -257,6 +257,7 @@ def write_ladder(rows: list[ActionError]) -> None:
                     "name": name,
                     "rmse_mm": {t: round(m["rmse_vertices_mm"], 2) for t, m in found.items()},
                     "inside": {t: round(m["penetration_share"], 5) for t, m in found.items()},
+                    "usual_ms": {t: round(m["ms_per_frame"], 1) for t, m in found.items()},
                 }
             )
     with atomic_write(ROOT / "src/physxnet_jax/evaluation/cost_table.json") as part:

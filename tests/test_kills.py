@@ -2,10 +2,12 @@
 
 import csv
 import dataclasses
+import json
 import os
 import pathlib
 import random
 import runpy
+import shutil
 import signal
 import subprocess
 import sys
@@ -51,6 +53,21 @@ def build(folder, out, *more):
     run = "import sys; from physxnet_jax.cli import main; sys.exit(main())"
     command = [sys.executable, "-c", run, *words, "--mocap", str(folder), *more]
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+@pytest.fixture(scope="module")
+def tests_to_judge(place):
+    """A small dataset of test actions."""
+    folder = place[0] / "tests"
+    folder.mkdir()
+    shutil.copy(place[0] / "punch.npz", folder)
+    with (folder / "ACTIONS.csv").open("w", newline="") as file:
+        table = csv.writer(file)
+        table.writerow(["split", "action", "file", "start_s", "frames_at_30fps"])
+        table.writerows(["test", f"judged {k}", "punch.npz", 0.1 * k, 6] for k in range(3))
+    (folder / "sets.toml").write_text(SETS.replace("train", "test"))
+    assert build(folder, "judged").wait(300) == 0
+    return folder / "judged"
 
 
 def stored(folder, out):
@@ -160,7 +177,18 @@ LONG = {
         "simulate walk --wear bottom --accuracy draft --frames 40 -o out.pc2",
         ("*.pc2", "*.obj"),
     ),
+    "adapt": (
+        "adapt bottom --weights nano --frames 40 --steps 250 -o mine",
+        ("mine/*",),
+    ),
+    "evaluate": (
+        "evaluate lbs nano nano+relax+push draft --data {data} --out out.json",
+        ("out*",),
+    ),
+    "calibrate": ("calibrate", ("cache/physxnet_jax/calibration.json",)),
 }
+# Keys of JSON files whose values are measured times, or follow from them.
+TIMES = ("ms_per_frame", "times", "seconds", "date", "machine")
 # Kills itself at the n-th file that is put in place: just before that, or just after.
 IN_A_WRITE = """
 import os, pathlib, signal, sys
@@ -189,31 +217,67 @@ sys.exit(main())
 def started(folder, words, before="", *more):
     folder.mkdir(exist_ok=True)
     command = [sys.executable, "-c", before + MAIN, *more, *words.split()]
+    environment = dict(os.environ)
+    if words == "calibrate":
+        environment["XDG_CACHE_HOME"] = str(folder / "cache")
     return subprocess.Popen(
-        command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        command,
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
 
 
+def without_times(value):
+    """A JSON value whose times are replaced by what they are of."""
+    if isinstance(value, list):
+        return [without_times(v) for v in value]
+    if not isinstance(value, dict):
+        return value
+    return {
+        k: str(v.keys() if isinstance(v, dict) else type(v)) if k in TIMES else without_times(v)
+        for k, v in value.items()
+    }
+
+
+def contents(path):
+    """What a file holds, measured times apart."""
+    if path.suffix == ".json":
+        return without_times(json.loads(path.read_text()))
+    # Tables and charts show times.
+    return None if path.suffix in (".md", ".png") else path.read_bytes()
+
+
 def results(folder, patterns):
-    return {p.name: p.read_bytes() for name in patterns for p in sorted(folder.glob(name))}
+    found = sorted({p for name in patterns for p in folder.glob(name) if p.is_file()})
+    return {str(p.relative_to(folder)): contents(p) for p in found}
+
+
+def files_of(folder):
+    # Compiled programs stay in the cache.
+    found = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.is_file()}
+    return {n for n in found if not n.startswith("cache/") or "calibration" in n}
 
 
 @pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    """The bytes of a command's outputs, and its time [s]."""
+def undisturbed(tmp_path_factory, request):
+    """The words of a command, what it leaves, and its time [s]."""
     known = {}
 
     def run(name):
         if name not in known:
             words, patterns = LONG[name]
+            if "{data}" in words:
+                words = words.format(data=request.getfixturevalue("tests_to_judge"))
             folder = tmp_path_factory.mktemp("undisturbed")
             for _ in range(2):
                 # The second time programs are compiled, as in the runs that are killed.
                 begun = time.monotonic()
                 assert started(folder, words).wait(600) == 0
                 seconds = time.monotonic() - begun
-            assert {p.name for p in folder.iterdir()} == set(results(folder, patterns))
-            known[name] = results(folder, patterns), seconds
+            assert files_of(folder) == set(results(folder, patterns))
+            known[name] = words, results(folder, patterns), seconds
         return known[name]
 
     return run
@@ -221,8 +285,8 @@ def undisturbed(tmp_path_factory):
 
 def killed(name, folder, undisturbed, seed):
     """Kills a command at a moment, by a signal or in a write, and lets it run again."""
-    words, patterns = LONG[name]
-    expected, seconds = undisturbed(name)
+    patterns = LONG[name][1]
+    words, expected, seconds = undisturbed(name)
     chance = random.Random(f"{name} {seed}")
     kind = chance.choice(["KILL", "TERM", "INT", "before", "after"])
     if kind in ("before", "after"):
@@ -235,11 +299,11 @@ def killed(name, folder, undisturbed, seed):
         process.wait(600)
     if kind in ("TERM", "INT"):
         # It had the time to tidy up.
-        left = {p.name for p in folder.iterdir()} - {".out.npz.unfinished", ".out.obj.unfinished"}
-        assert left <= {*expected, ".out.pc2.unfinished"}, (kind, left)
+        left = {n for n in files_of(folder) if not n.partition("/")[0].endswith(".unfinished")}
+        assert left <= set(expected), (kind, left)
     assert started(folder, words).wait(600) == 0
     assert results(folder, patterns) == expected, (kind, process.returncode)
-    assert {p.name for p in folder.iterdir()} == set(expected), "something was left lying"
+    assert files_of(folder) == set(expected), "something was left lying"
     return process.returncode
 
 

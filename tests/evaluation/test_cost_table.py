@@ -1,6 +1,8 @@
 """The ladder: what is picked is within what was asked, and nothing is timed twice."""
 
 import json
+import pathlib
+import tempfile
 import types
 
 import pytest
@@ -13,6 +15,7 @@ from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.evaluation import (
     MethodProfile,
     calibrate,
+    choose_method,
     load_cost_table,
     select_method,
     worn_key,
@@ -23,8 +26,9 @@ from physxnet_jax.models import list_weights
 from physxnet_jax.simulation import PRESETS
 
 
-def profile(name, error, inside=0.0):
-    return MethodProfile(name, dict.fromkeys(TEMPLATES, error), dict.fromkeys(TEMPLATES, inside))
+def profile(name, error, inside=0.0, ms=1.0):
+    errors, within = (dict.fromkeys(TEMPLATES, x) for x in (error, inside))
+    return MethodProfile(name, errors, within, dict.fromkeys(TEMPLATES, ms))
 
 
 RUNGS = [
@@ -126,20 +130,76 @@ def test_times_of_another_process_are_kept(tmp_path):
     assert kept["machine"]["cpu"] == processor_name()
 
 
-@pytest.mark.nightly
-def test_post_processing_is_timed_once_for_all_networks(tmp_path):
-    profiles = [
-        profile(n, 10.0) for n in ("nano", "nano+push", "nano+relax+push", "small+relax+push")
+# Names of simulators, which need no weights; what they take here is given below.
+SLOW = [
+    profile("lbs", 40.0, ms=0.2),
+    profile("draft", 20.0, ms=10.0),
+    profile("standard", 9.0, ms=40.0),
+    profile("fine", 1.0, ms=400.0),
+]
+
+
+@pytest.mark.parametrize(
+    ("asked", "here", "timed", "picked"),
+    [
+        # As fast as expected: the best that may fit is timed, and fits.
+        ({"budget_ms": 45.0}, 1.0, ["standard"], "standard"),
+        # Half as fast: it doesn't fit; the next is expected to, and does.
+        ({"budget_ms": 45.0}, 2.0, ["standard", "draft"], "draft"),
+        ({"budget_ms": 0.3}, 1.0, ["lbs"], "lbs"),
+        ({"max_error_mm": 25.0}, 3.0, ["draft"], "draft"),
+        ({"max_error_mm": 2.0}, 1.0, ["fine"], "fine"),
+        # Nothing does: the nearest is timed, and named.
+        ({"budget_ms": 0.01}, 1.0, ["lbs"], None),
+        ({"max_error_mm": 0.5}, 1.0, ["fine"], None),
+    ],
+)
+def test_only_what_matters_for_a_limit_is_timed(tmp_path, monkeypatch, asked, here, timed, picked):
+    seen = []
+
+    def measure(_, r, worn):
+        seen.append(r.name)
+        return here * sum(r.usual_ms[t] for t in worn)
+
+    monkeypatch.setattr(_Clock, "_measure", measure)
+
+    def choose():
+        return choose_method(["top"], SLOW, path=tmp_path / "times.json", **asked)
+
+    if picked is None:
+        with pytest.raises(PhysXNetError, match=f"nearest is {timed[0]}"):
+            choose()
+    else:
+        assert choose().profile.name == picked
+        choose()
+    # The second time nothing is.
+    assert seen == timed
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.floats(1, 50), st.floats(0.1, 100), st.floats(0.3, 3)), min_size=1, max_size=4
+    ),
+    st.floats(0.05, 300),
+)
+def test_what_is_chosen_keeps_the_budget_whatever_was_expected(profiles, budget):
+    rungs = [
+        profile(n, error, ms=ms)
+        for n, (error, ms, _) in zip(("lbs", "draft", "standard", "fine"), profiles, strict=False)
     ]
-    path = tmp_path / "times.json"
-    times = calibrate(profiles, [("bottom",)], path=path, frames=16)
-    kept = json.loads(path.read_text())["times"]
-    plain = next(v for k, v in kept.items() if k.startswith("small "))["bottom"]
-    push, relaxed = (kept[way]["bottom"] for way in ("+push", "+relax"))
-    assert push > 0 and relaxed > 0
-    assert times["nano+push"]["bottom"] == times["nano"]["bottom"] + push
-    assert times["nano+relax+push"]["bottom"] == times["nano"]["bottom"] + relaxed + push
-    assert times["small+relax+push"]["bottom"] == plain + relaxed + push
+    truth = {r.name: r.usual_ms["top"] * p[2] for r, p in zip(rungs, profiles, strict=True)}
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_Clock, "_measure", lambda _, r, worn: truth[r.name])
+        path = pathlib.Path(folder) / "times.json"
+        try:
+            choice = choose_method(["top"], rungs, path=path, budget_ms=budget)
+        except PhysXNetError:
+            # Only if the cheapest by expectation doesn't fit.
+            cheapest = min(rungs, key=lambda r: r.usual_ms["top"])
+            assert truth[cheapest.name] > budget
+        else:
+            assert choice.ms_per_frame == truth[choice.profile.name] <= budget
 
 
 @pytest.mark.release
@@ -150,7 +210,7 @@ def test_every_packaged_method_can_dress():
     # None that leaves cloth in the body, but skinning.
     assert all(n.endswith(("+push", "+guided")) for n in names - {"lbs", *PRESETS})
     for r in ladder:
-        assert set(r.rmse_mm) == set(r.inside) == set(TEMPLATES)
+        assert set(r.rmse_mm) == set(r.inside) == set(r.usual_ms) == set(TEMPLATES)
         assert r.name.partition("+")[0] in {"lbs", *list_weights(), *PRESETS}
         assert r.identity.startswith(r.name)
     plain = {r.name: r for r in ladder}
@@ -166,7 +226,8 @@ def test_every_packaged_method_can_dress():
 def test_dress_uses_the_selected_method(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(
-        "physxnet_jax.cli._calibrate.load_cost_table", lambda: [profile("lbs", 20.0)]
+        "physxnet_jax.cli._calibrate.load_cost_table",
+        lambda: [profile("lbs", 20.0)],
     )
     words = ["dress", "walk", "--wear", "bottom", "--frames", "2"]
     assert main([*words, "--max-error-mm", "25"]) == 0

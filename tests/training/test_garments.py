@@ -19,11 +19,12 @@ from physxnet_jax.data import (
     read_entry,
 )
 from physxnet_jax.dressing import Inference, clothe, clothe_step, init_stream, make_dresser
-from physxnet_jax.errors import FormatError
+from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.garment import tailor
 from physxnet_jax.geometry import mesh_edges, patch_shares
 from physxnet_jax.models import ModelConfig, load_predictor, save_predictor
 from physxnet_jax.motion import load_motion
+from physxnet_jax.simulation import elastic_tables
 from physxnet_jax.training import LossInputs, TrainConfig, train
 from physxnet_jax.training._garment_tables import prepare_garments
 from physxnet_jax.training._problem import configured_loss
@@ -117,6 +118,7 @@ def test_share_of_patches_weighs_both_parts():
             edges=None,
             means=(jnp.zeros((1, 1, 3)), jnp.full((1, 1, 3), 0.1), jnp.ones((1, 1))),
             differences=(jnp.zeros((1, 1, 3)), jnp.full((1, 1, 3), -0.6), jnp.ones((1, 1))),
+            elastic=jnp.full(1, 5.0),
             atlas=make_atlas(32),
         )
 
@@ -125,10 +127,83 @@ def test_share_of_patches_weighs_both_parts():
         assert float(loss(inputs())) == pytest.approx(wanted, rel=1e-5)
     both = dataclasses.replace(CONFIG, patch_share=0.25, vertex_share=1.0, edge_share=0.5)
     assert float(configured_loss(both)(inputs())) == pytest.approx(0.425, rel=1e-5)
-    wrong = (({"patch_share": 2.0}, "from 0 to 1"), ({"patch_share": 0.5}, "conditions"))
+    firm = dataclasses.replace(both, elastic_weight=0.01)
+    assert float(configured_loss(firm)(inputs())) == pytest.approx(0.475, rel=1e-5)
+    wrong = (
+        ({"patch_share": 2.0}, "from 0 to 1"),
+        ({"patch_share": 0.5}, "conditions"),
+        ({"elastic_weight": 0.5}, "conditions"),
+        ({"elastic_weight": -1.0, "model": MODEL, "adversarial": False}, "elastic_weight"),
+    )
     for given, says in wrong:
         with pytest.raises(ValueError, match=says):
             TrainConfig(**given)
+
+
+def test_elastic_energy_is_that_of_each_garment_on_its_person(body):
+    wardrobe = make_wardrobe([TIGHT, LOOSE], ("top",))
+    *_, tables = prepare_garments(MODEL, wardrobe, elastic=True)
+    both, joints = jnp.asarray([1, 0]), len(body.parents)
+    most = wardrobe.num_vertices("top")
+    offsets = 0.01 * jax.random.normal(jax.random.key(3), (2, most, 3))
+    still = jnp.broadcast_to(jnp.eye(3), (2, joints, 3, 3)), jnp.zeros((2, joints, 3))
+    found = tables["top"].elastic_energy(offsets, both, *still)
+    for k, outfit in enumerate((LOOSE, TIGHT)):
+        (garment,) = outfit.garments().values()
+        rest = garment.rest_vertices(body.rest_vertices(outfit.params()))
+        (own,) = (jax.tree.map(lambda x: x[0], elastic_tables([garment], [outfit.params()])),)
+        wanted = own.energy(rest + offsets[k, : garment.num_vertices]) / own.lift(0.01)
+        np.testing.assert_allclose(found[k], wanted, rtol=1e-3)
+    # A person who has turned and gone elsewhere has the same.
+    turn = jnp.asarray([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+    away = (
+        jnp.broadcast_to(turn, still[0].shape),
+        still[1] + jnp.asarray([3.0, 0.0, 1.0])[None, None],
+    )
+    np.testing.assert_allclose(tables["top"].elastic_energy(offsets, both, *away), found, rtol=2e-3)
+    idle = dataclasses.replace(tables["top"], elastic=None)
+    assert idle.elastic_energy(offsets, both, *still) is None
+
+
+@pytest.mark.release
+def test_training_goes_on_from_weights_and_lowers_their_elastic_energy(learned, tmp_path):
+    save_predictor(tmp_path / "w", learned, name="w")
+    data = [sequence(TIGHT, 0.0), sequence(LOOSE, -OFF)]
+    onward = dataclasses.replace(
+        CONFIG, start=str(tmp_path / "w"), epochs=8, learning_rate=1e-2, elastic_weight=2.0
+    )
+    energies = {}
+    for name, config in {
+        "without": dataclasses.replace(onward, elastic_weight=0.0),
+        "with": onward,
+    }.items():
+        found = train(config, data, tmp_path / name)
+        assert float(found.normalisation.offset["top"]) == float(
+            learned.normalisation.offset["top"]
+        )
+        energies[name] = energy_of(found)
+    # What skinning alone does to the cloth is no choice of the network's.
+    before, skinned = energy_of(learned), energy_of(None)
+    assert energies["with"] - skinned < 0.6 * (energies["without"] - skinned)
+    # Without, it hardly changes: the run went on from the weights.
+    assert energies["without"] == pytest.approx(before, rel=0.1)
+    other = dataclasses.replace(onward, model=dataclasses.replace(MODEL, width=8))
+    with pytest.raises(PhysXNetError, match="another model"):
+        train(other, data, tmp_path / "other")
+
+
+def energy_of(weights):
+    """Elastic energy of tight cloth on the walk, over that of lifting it by 1 cm."""
+    (garment,) = TIGHT.garments().values()
+    if weights is None:
+        dresser = make_dresser([garment], method="lbs")
+    else:
+        inference = Inference(weights=weights, strain_iterations=0, collisions=False)
+        dresser = make_dresser([garment], inference=inference)
+    motion = load_motion("walk", fps=30.0)
+    cloth = clothe(dresser, motion.rotations[4:8], motion.root[4:8], 30.0)[garment.name]
+    table = jax.tree.map(lambda x: x[0], elastic_tables([garment], [None]))
+    return float(jnp.mean(jax.vmap(table.energy)(cloth)) / table.lift(0.01))
 
 
 def test_what_needs_one_garment_is_refused():

@@ -13,8 +13,8 @@ from ..evaluation import (
     Selection,
     calibrate as measure,
     calibration_file,
+    choose_method,
     load_cost_table,
-    select_method,
     worn_key,
 )
 from ..garment import TEMPLATES, Template, load_garment
@@ -64,11 +64,10 @@ def choose(command: Dress, progress: Callable[[str, int, int], None]) -> Selecti
         return None
     cost_table = load_cost_table()
     templates: list[Template] = [load_garment(g)[0].template for g in command.outfit.words]
-    times = measure(cost_table, [templates], report=lambda _, k, n: progress("timing", k, n))
-    return select_method(
+    return choose_method(
         templates,
-        times,
         cost_table,
         budget_ms=command.budget_ms,
         max_error_mm=command.max_error_mm,
+        report=lambda _, k, n: progress("timing", k, n),
     )

@@ -21,6 +21,7 @@ from ._outfit import (
     Outfit as Outfit,
     Worn as Worn,
     garment_of as garment_of,
+    person_shape as person_shape,
     shape_of as shape_of,
 )
 from ._protocol import (

@@ -187,14 +187,21 @@ def _network(task: Task, params: Any) -> Any:
     return network
 
 
-def _cloth(task: Task, params: Any, frames: Frames) -> Float[Array, "frames vertices 3"]:
-    """The garment as a network of these parameters predicts it [m]."""
-    predictor, bound, network = task.predictor, task.bound, _network(task, params)
+def predict_maps(task: Task, params: Any, frames: Frames) -> Float[Array, "frames height width 3"]:
+    """Maps of offsets, relative to their scale, as a network of these parameters predicts them."""
+    bound, network = task.bound, _network(task, params)
     known = None
     if task.conditions is not None:
         known = network.modulation(bound.template, task.conditions[None])
     features = [f.astype(jnp.float32) for f in frames.features]
-    maps = network.decode(bound.template, features, known)
+    return network.decode(bound.template, features, known)
+
+
+def place_maps(
+    task: Task, maps: Float[Array, "frames height width 3"], frames: Frames
+) -> Float[Array, "frames vertices 3"]:
+    """The garment that follows from maps of offsets [m]."""
+    predictor, bound = task.predictor, task.bound
     scale, valid = (
         x[bound.template] for x in (predictor.normalisation.offset, predictor.texel_points.valid)
     )
@@ -203,17 +210,41 @@ def _cloth(task: Task, params: Any, frames: Frames) -> Float[Array, "frames vert
     return jax.vmap(place)(frames.rotations, frames.translations, bound.sample(offsets))
 
 
+def mean_errors(
+    task: Task, away: Float[Array, "frames vertices 3"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Mean absolute error at vertices and at means over patches, relative to 1 cm."""
+    means = jnp.einsum("pk,fpkc->fpc", task.share, away[:, task.index])
+    return jnp.mean(jnp.abs(away)) / _LENGTH, jnp.mean(jnp.abs(means)) / _LENGTH
+
+
 def task_loss(
     task: Task, params: Any, frames: Frames
 ) -> tuple[Float[Array, ""], dict[str, Float[Array, ""]]]:
     """The loss of some windows, and what it consists of."""
     config = task.config
-    x = _cloth(task, params, frames)
+    x = place_maps(task, predict_maps(task, params, frames), frames)
     away = x - frames.target
-    means = jnp.einsum("pk,fpkc->fpc", task.share, away[:, task.index])
-    error = jnp.mean(jnp.abs(means)) / _LENGTH
+    everywhere, error = mean_errors(task, away)
     if task.simulated:
-        error = 0.5 * error + 0.5 * jnp.mean(jnp.abs(away)) / _LENGTH
+        error = 0.5 * error + 0.5 * everywhere
+    potential = mean_potential(task, x, frames)
+    weight = _WEIGHTS[task.simulated] if config.potential is None else config.potential
+    total = error + weight * potential / lift_energy(task)
+    squared = jnp.mean(jnp.sum(away**2, axis=2))
+    return total, {"loss": total, "potential": potential, "squared": squared}
+
+
+def lift_energy(task: Task) -> Float[Array, ""]:
+    """What it takes to lift the garment by 1 cm [J]."""
+    return 9.81 * _LENGTH * jnp.sum(task.mass)
+
+
+def mean_potential(
+    task: Task, x: Float[Array, "frames vertices 3"], frames: Frames
+) -> Float[Array, ""]:
+    """The potential of the cloth in windows of successive frames, and of contact [J]."""
+    config = task.config
     (pushed,) = apply_collisions(
         (task.collider,), (jax.lax.stop_gradient(x),), frames.rotations, frames.translations
     )
@@ -227,12 +258,7 @@ def task_loss(
     energy = incremental_potential(
         task.system, _as_batch(window[:, 2:]), before, FPS * (before - older), length=1.0 / FPS
     )
-    potential = jnp.mean(energy) + contact
-    lift = 9.81 * _LENGTH * jnp.sum(task.mass)
-    weight = _WEIGHTS[task.simulated] if config.potential is None else config.potential
-    total = error + weight * potential / lift
-    squared = jnp.mean(jnp.sum(away**2, axis=2))
-    return total, {"loss": total, "potential": potential, "squared": squared}
+    return jnp.mean(energy) + contact
 
 
 def _as_batch(
@@ -286,4 +312,5 @@ def _encode_block(task: Task, params: Any, rotations: Array, translations: Array
         translations=translations[first:],
         target=None,
     )
-    return dataclasses.replace(frames, target=_cloth(task, params, frames))
+    cloth = place_maps(task, predict_maps(task, params, frames), frames)
+    return dataclasses.replace(frames, target=cloth)

@@ -44,8 +44,8 @@ _SUBSTEPS = 8
 _CONVERGED = 128
 # Rate for which a scene is prepared [1/s]; for others it is prepared again within the call.
 _RATE = 30.0
-# Time constant of the guide for each substep a frame [s]: the finer, the freer.
-_TIME_CONSTANT = 0.0025
+# Time constant of the guide [s]: a longer one lets cloth slide that more substeps would hold.
+_TIME_CONSTANT = 0.02
 # Distance between the middles of patches [m]: nearer ones pass on the network's own noise.
 _SPACING = 0.12
 # Distance of a patch from its prediction at which the cloth starts anew [m].
@@ -141,7 +141,7 @@ def prepare_guided(
     substeps = simulation.substeps or _SUBSTEPS
     solver = dataclasses.replace(simulation, substeps=substeps).solver
     given = [e for e in simulation.effects or () if isinstance(e, Guide)]
-    guide = given or [Guide(spacing=_SPACING, time_constant=_TIME_CONSTANT * substeps)]
+    guide = given or [Guide(spacing=_SPACING, time_constant=_TIME_CONSTANT)]
     # Effects that are given are taken as they are.
     contact = _contact(len(outfit.garments)) if simulation.effects is None else ()
     scene = build_scene(outfit.garments, outfit.body, shape, simulation, (*guide, *contact))

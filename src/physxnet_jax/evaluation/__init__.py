@@ -34,6 +34,7 @@ from ._cost_table import (
     Selection as Selection,
     calibrate as calibrate,
     calibration_file as calibration_file,
+    choose_method as choose_method,
     load_cost_table as load_cost_table,
     select_method as select_method,
     worn_key as worn_key,
@@ -47,6 +48,7 @@ from ._evaluate import (
     retime as retime,
 )
 from ._evaluate_dataset import evaluate_dataset as evaluate_dataset
+from ._likeness import Likeness as Likeness, likeness as likeness
 from ._method_names import (
     MIRROR as MIRROR,
     method_by_name as method_by_name,

@@ -1,9 +1,11 @@
 """Cost table of dressing methods: their measured errors and their times on this machine."""
 
 import dataclasses
+import functools
 import importlib.resources
 import json
 import pathlib
+import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -18,16 +20,16 @@ from ..models import read_card
 from ..motion import BLOCK, Motion, load_motion
 from ..simulation import PRESETS
 from ._cost import clothing_cost
-from ._method_names import GUIDED, PUSH, RELAX, method_by_name, parse_method
+from ._method_names import GUIDED, method_by_name, parse_method
 from ._saved_rows import machine
 
 _FRAMES = 64
 # Calls of a network are timed for this long [s].
 _SECONDS = 0.5
-# Attempts to time a post-processing step whose measured cost isn't positive.
-_ATTEMPTS = 4
 # Times with another value of this marker were measured differently and are discarded.
-_TIMING_VERSION = "tailored garments together"
+_TIMING_VERSION = "tailored garments together, each profile as a whole"
+# A profile is timed for a limit if it is expected to take at most this many times as long.
+_DOUBT = 1.5
 ALONE_AND_TOGETHER: tuple[tuple[Template, ...], ...] = (*((t,) for t in TEMPLATES), TEMPLATES)
 """Each template alone, and all of them together."""
 
@@ -43,11 +45,14 @@ class MethodProfile:
             ``standard`` setting [mm], by template: of the shirt, the trousers and the A-line
             dress.
         inside: Share of vertices inside the body by template, pinched ones excluded.
+        usual_ms: Time per frame for each template on the machine that measured the errors [ms]:
+            which profiles are worth timing here.
     """
 
     name: str
     rmse_mm: dict[str, float]
     inside: dict[str, float]
+    usual_ms: dict[str, float]
 
     @property
     def options(self) -> dict[str, Any]:
@@ -68,6 +73,10 @@ class MethodProfile:
             return self.name
         card = read_card(str(parse_method(self.name).weights))
         return f"{self.name} {card['sha256'][:12]}"
+
+    def error_mm(self, templates: Sequence[str]) -> float:
+        """Mean error of some garments [mm]."""
+        return statistics.fmean(self.rmse_mm[t] for t in templates)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,8 +131,7 @@ def calibrate(
 
     Returns:
         For each profile and `worn_key`, the median time per frame after warm-up, from joint
-        rotations to vertices [ms]. Strain limiting and collision resolution cost the same for
-        every network; they are timed with the first one and added to the others.
+        rotations to vertices [ms].
     """
     clock = _Clock(calibration_file() if path is None else path, frames)
     jobs = [(r, w) for r in profiles for w in worn if all(t in r.rmse_mm for t in w)]
@@ -143,8 +151,14 @@ class _Clock:
         self._machine = machine() | {"timed": _TIMING_VERSION, "version": __version__}
         same = cached.get("machine") == self._machine
         self.times: dict[str, dict[str, float]] = cached["times"] if same else {}
+        self._frames = frames
+
+    @functools.cached_property
+    def _walk(self) -> Motion:
         walk = load_motion("walk", fps=30.0)
-        self._walk = Motion(walk.rotations[:frames], walk.root[:frames], walk.fps, walk.name)
+        return Motion(
+            walk.rotations[: self._frames], walk.root[: self._frames], walk.fps, walk.name
+        )
 
     def time_of(self, profile: MethodProfile, templates: Sequence[Template]) -> float:
         """Time per frame [ms]."""
@@ -161,28 +175,6 @@ class _Clock:
             method = method_by_name(profile.name)
             worn = (Worn(outfit=Outfit(wear=(DEFAULT_KINDS[t],)), template=t) for t in templates)
             return sum(method(self._walk, w).ms_per_frame for w in worn)
-        # Post-processing costs the same for all networks: it is timed with the first one.
-        last = next((w for w in (PUSH, RELAX) if profile.name.endswith(w)), None)
-        if last is None:
-            return self._together(profile, templates)
-        without_last = dataclasses.replace(profile, name=profile.name.removesuffix(last))
-        plain = self.time_of(without_last, templates)
-        known = self.times.setdefault(last, {})
-        key = worn_key(templates)
-        if key not in known:
-            for _ in range(_ATTEMPTS):
-                # Time both now: the machine's speed may have changed since the other was timed.
-                total = self._together(profile, templates)
-                extra = total - self._together(without_last, templates)
-                if extra > 0.0:
-                    break
-            else:
-                # Lost in the noise; it isn't cached, so that it is timed again.
-                return max(plain, total)
-            self._store(known, key, extra)
-        return plain + known[key]
-
-    def _together(self, profile: MethodProfile, templates: Sequence[Template]) -> float:
         garments = [tailor(DEFAULT_KINDS[t]) for t in templates]
         dresser = make_dresser(garments, **profile.options)
         return clothing_cost(dresser, self._walk, BLOCK, seconds=_SECONDS)["ms_per_frame"]
@@ -199,6 +191,79 @@ class _Clock:
             with atomic_write(self._path) as part:
                 cached = {"machine": self._machine, "times": self.times}
                 part.write_text(json.dumps(cached, indent=1) + "\n")
+
+
+def choose_method(
+    templates: Sequence[Template],
+    profiles: Sequence[MethodProfile],
+    *,
+    budget_ms: float | None = None,
+    max_error_mm: float | None = None,
+    path: pathlib.Path | None = None,
+    frames: int = _FRAMES,
+    report: Callable[[str, int, int], None] | None = None,
+) -> Selection:
+    """`select_method`, timing on this machine only the profiles that matter.
+
+    Profiles without a time here are expected to take their `MethodProfile.usual_ms`, times the
+    ratio that those with one have shown. With a budget the most accurate profile that may fit is
+    timed, until one fits; with an error the one that may be fastest, until it is.
+
+    Args:
+        templates: Template of each garment to wear.
+        profiles: Profiles to choose from.
+        budget_ms: Largest time per frame for all garments together [ms].
+        max_error_mm: Largest mean error over the garments [mm].
+        path: File of the cached times; `calibration_file` by default.
+        frames: Number of frames of the built-in walk that are dressed.
+        report: Called with a text, the profiles timed and the number of all.
+
+    Raises:
+        PhysXNetError: No profile is that fast or that accurate; the text names the nearest.
+    """
+    _check_request(templates, budget_ms, max_error_mm)
+    clock = _Clock(calibration_file() if path is None else path, frames)
+    key = worn_key(templates)
+    able = [r for r in profiles if all(t in r.rmse_mm for t in templates)]
+
+    def known() -> dict[str, float]:
+        """Times of the profiles that have one here."""
+        found = {r.name: clock.times.get(r.identity, {}).get(key) for r in able}
+        return {name: ms for name, ms in found.items() if ms is not None}
+
+    def expected() -> dict[str, float]:
+        usual = {r.name: sum(r.usual_ms[t] for t in templates) for r in able}
+        here = known()
+        ratio = statistics.median([here[n] / usual[n] for n in here] or [1.0])
+        return {n: here.get(n, ratio * ms) for n, ms in usual.items()}
+
+    while able:
+        here, guess = known(), expected()
+        if budget_ms is not None:
+            fits = [
+                r for r in able if guess[r.name] <= budget_ms * (1.0 if r.name in here else _DOUBT)
+            ]
+            best = min(fits, key=lambda r: r.error_mm(templates), default=None)
+        else:
+            fits = [r for r in able if r.error_mm(templates) <= (max_error_mm or 0.0)]
+            best = min(fits, key=lambda r: guess[r.name], default=None)
+        # Nothing may do: the text of the error names the nearest, with its time here.
+        best = best or min(
+            able,
+            key=lambda r: guess[r.name] if max_error_mm is None else r.error_mm(templates),
+        )
+        if best.name in here:
+            break
+        if report is not None:
+            report(f"timing {best.name}, {', '.join(templates)}", len(here), len(able))
+        clock.time_of(best, templates)
+    return select_method(
+        templates,
+        {name: {key: ms} for name, ms in known().items()},
+        profiles,
+        budget_ms=budget_ms,
+        max_error_mm=max_error_mm,
+    )
 
 
 def select_method(
@@ -221,16 +286,13 @@ def select_method(
     Raises:
         PhysXNetError: No profile is that fast or that accurate; the text names the nearest.
     """
-    if (budget_ms is None) == (max_error_mm is None):
-        raise PhysXNetError("give either a time (budget_ms) or an error (max_error_mm).")
-    if not templates:
-        raise PhysXNetError("nothing is worn: templates is empty.")
+    _check_request(templates, budget_ms, max_error_mm)
 
     def cost(r: MethodProfile) -> float:
         return times[r.name][key]
 
     def error(r: MethodProfile) -> float:
-        return sum(r.rmse_mm[t] for t in templates) / len(templates)
+        return r.error_mm(templates)
 
     key = worn_key(templates)
     candidates = [
@@ -270,6 +332,15 @@ def select_method(
         finer = min(better, key=cost)
         summary += f"; {finer.name} would take {cost(finer):.2f} ms for {error(finer):.1f} mm"
     return Selection(best, cost(best), error(best), summary)
+
+
+def _check_request(
+    templates: Sequence[str], budget_ms: float | None, max_error_mm: float | None
+) -> None:
+    if (budget_ms is None) == (max_error_mm is None):
+        raise PhysXNetError("give either a time (budget_ms) or an error (max_error_mm).")
+    if not templates:
+        raise PhysXNetError("nothing is worn: templates is empty.")
 
 
 def _read(path: pathlib.Path) -> dict[str, Any]:

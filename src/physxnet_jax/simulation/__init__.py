@@ -14,6 +14,7 @@ from ._effect import (
     PosedPoints as PosedPoints,
     Prepared as Prepared,
 )
+from ._elastic_tables import ElasticTables as ElasticTables, elastic_tables as elastic_tables
 from ._implicit import Implicit as Implicit
 from ._potential import incremental_potential as incremental_potential
 from ._prepared_scene import PreparedScene as PreparedScene

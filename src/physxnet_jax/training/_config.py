@@ -37,11 +37,16 @@ class TrainConfig:
         patch_share: Share of the loss that is taken at means over patches of 8 cm instead of at
             vertices: folds within a patch are chaotic, their mean isn't. Only with
             ``model.conditions``.
+        elastic_weight: Weight of the cloth's elastic energy, relative to lifting the garment by
+            1 cm, beside an error of 1 cm: what an error lets open between neighbouring vertices,
+            the energy of springs and hinges closes. Only with ``model.conditions``.
         pyramid_levels: The loss at texels is the mean over this many resolutions of maps, each
             half the previous one; 1 is the paper's.
         adversarial: Whether to train with a discriminator.
         discriminator_width: Channels of the discriminator's first layer.
         mirror_augmentation: Also train on the mirror image of every action.
+        start: Weights to go on from, a name or a folder, with their scales of inputs and outputs;
+            random ones if empty.
         seed: Seed of all random numbers.
         precision: Precision of the network's arithmetic; parameters and losses stay float32.
         validation: Names of training actions that are held out for validation. The weights
@@ -69,10 +74,12 @@ class TrainConfig:
     vertex_share: float = 0.0
     edge_share: float = 0.0
     patch_share: float = 0.0
+    elastic_weight: float = 0.0
     pyramid_levels: int = 1
     adversarial: bool = True
     discriminator_width: int = 16
     mirror_augmentation: bool = False
+    start: str = ""
     seed: int = 0
     precision: Literal["float32", "bfloat16"] = "float32"
     validation: tuple[str, ...] = ()
@@ -86,7 +93,7 @@ class TrainConfig:
         check_counts(self, "epochs", "batch", "discriminator_width", "validate_every")
         check_counts(self, "patience", "checkpoint_every", "frames_in_memory", "max_skipped")
         check_numbers(self, "learning_rate", "discriminator_rate", "muon_learning_rate")
-        check_numbers(self, "l1_weight", zero=True)
+        check_numbers(self, "l1_weight", "elastic_weight", zero=True)
         if not 0.0 <= self.b1 < 1.0:
             raise ValueError(f"b1 is {self.b1}; it must be at least 0 and below 1.")
         if not 0.0 <= self.vertex_share <= 1.0:
@@ -101,6 +108,8 @@ class TrainConfig:
             raise ValueError(f"patch_share is {self.patch_share}; it must be from 0 to 1.")
         if self.patch_share and not self.model.conditions:
             raise ValueError("patch_share needs model.conditions.")
+        if self.elastic_weight and not self.model.conditions:
+            raise ValueError("elastic_weight needs model.conditions.")
         if self.model.conditions and self.adversarial:
             raise ValueError(
                 "conditions: every sample has a garment of its own, whose vertices alone are"

@@ -98,7 +98,9 @@ def load_data(config: TrainConfig, sequences: Items[Sequence | Where | Entry]) -
             motion_atlas=atlas,
             normalisation=scales,
         )
-    atlas, motion_atlas, points, persons, garments = prepare_garments(model, wardrobe)
+    atlas, motion_atlas, points, persons, garments = prepare_garments(
+        model, wardrobe, elastic=config.elastic_weight > 0
+    )
     share = config.frames_in_memory // len(model.templates)
     each = {
         t: frames_of(dataclasses.replace(wardrobe, garments={t: wardrobe.garments[t]}), share)

@@ -8,17 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..body import load_body
-from ..data import QUANTIZATION_STEP, Frames, Wardrobe
+from ..body import load_body, skin_points
+from ..data import QUANTIZATION_STEP, Frames, Wardrobe, person_shape
 from ..errors import FormatError
-from ..geometry import mesh_edges, pad_rows, patch_shares
+from ..geometry import mesh_edges, pad_rows, patch_shares, polar_rotation
 from ..models import ModelConfig, Normalisation, TexelPoints, make_texel_points
+from ..simulation import ElasticTables, elastic_tables
 from ..typing import pytree
 from ..uv import Atlas, bind, condition_maps, make_atlas
 from ._targets import motion_scales, scale_of
 
 # Distance between the middles of patches [m].
 _PATCH = 0.08
+ERROR_UNIT = 0.01
+"""Errors are relative to this length, elastic energies to lifting the garment by it [m]."""
 
 
 @pytree
@@ -36,6 +39,9 @@ class GarmentTables:
         share: Their shares in the vertex, shape [garments, vertices, m].
         patches: Number of patches of the garment that has most.
         edges: Vertices of each edge, shape [garments, edges, 2]; padding joins vertex 0 to itself.
+        rest: Vertices at rest [m], shape [garments, vertices, 3].
+        skin: Their skinning weights, shape [garments, vertices, joints].
+        elastic: Springs and hinges; None where their energy doesn't count.
     """
 
     texel: Int[Array, "garments vertices k"]
@@ -45,6 +51,9 @@ class GarmentTables:
     patch: Int[Array, "garments vertices m"]
     share: Float[Array, "garments vertices m"]
     edges: Int[Array, "garments edges 2"]
+    rest: Float[Array, "garments vertices 3"]
+    skin: Float[Array, "garments vertices joints"]
+    elastic: ElasticTables | None
     patches: int = dataclasses.field(metadata={"static": True})
 
     def differences(
@@ -69,6 +78,33 @@ class GarmentTables:
             return total / jnp.maximum(weight, 1e-6)[:, None], weight
 
         return jax.vmap(one)(values, garment)
+
+    def elastic_energy(
+        self,
+        offsets: Float[Array, "batch vertices 3"],
+        garment: Int[Array, " batch"],
+        rotations: Float[Array, "batch joints 3 3"],
+        translations: Float[Array, "batch joints 3"],
+    ) -> Float[Array, " batch"] | None:
+        """Elastic energy of one garment each over that of lifting it by 1 cm; None if it's unknown.
+
+        Args:
+            offsets: Offsets in the vertices' own frames [m].
+            garment: The garment of each sample.
+            rotations: World rotations of joints.
+            translations: World translations of joints [m].
+        """
+        elastic = self.elastic
+        if elastic is None:
+            return None
+
+        def one(o: Array, g: Array, r: Array, t: Array) -> Array:
+            points, blend = skin_points(self.rest[g], self.skin[g], r, t)
+            turned = jnp.einsum("vab,vb->va", polar_rotation(blend), o, precision="highest")
+            mine = jax.tree.map(lambda x: x[g], elastic)
+            return mine.energy(points + turned) / mine.lift(ERROR_UNIT)
+
+        return jax.vmap(one)(offsets, garment, rotations, translations)
 
     def sample(
         self, maps: Float[Array, "batch texels 3"], garment: Int[Array, " batch"]
@@ -98,11 +134,16 @@ class Persons:
 
 
 def prepare_garments(
-    model: ModelConfig, wardrobe: Wardrobe
+    model: ModelConfig, wardrobe: Wardrobe, *, elastic: bool = False
 ) -> tuple[Atlas, Atlas, TexelPoints, Persons, dict[str, GarmentTables]]:
     """Atlases of offsets and of motion, texel points, and the tables of all garments.
 
     A texel is valid for a template if a vertex of one of its garments samples it.
+
+    Args:
+        model: The network.
+        wardrobe: What is worn in the data, and on which bodies.
+        elastic: Whether the elastic energy of the garments is needed.
 
     Raises:
         FormatError: The wardrobe lacks a template of the model.
@@ -132,6 +173,10 @@ def prepare_garments(
             for g in garments
         ]
         edges = [mesh_edges(np.asarray(g.mesh.faces)).vertices for g in garments]
+        shapes = _shapes(wardrobe, name)
+        rests = [
+            g.rest_vertices(body.rest_vertices(s)) for g, s in zip(garments, shapes, strict=True)
+        ]
         tables[name] = GarmentTables(
             texel=jnp.asarray(np.stack([_padded(b.texel, count) for b in bound])),
             weight=jnp.asarray(np.stack([_padded(b.weight, count) for b in bound])),
@@ -144,11 +189,21 @@ def prepare_garments(
             edges=jnp.asarray(
                 np.stack([_padded(e, max(map(len, edges))) for e in edges]).astype(np.int32)
             ),
+            rest=jnp.asarray(np.stack([_padded(r, count) for r in rests])),
+            skin=jnp.asarray(np.stack([_padded(g.skin, count) for g in garments])),
+            elastic=elastic_tables(garments, shapes) if elastic else None,
             patches=max(int(i.max()) + 1 for i, _ in shares),
         )
     points = make_texel_points(motion_atlas, body, rest, valid)
     rests = jnp.stack([motion_atlas.at_texels(r) for r in wardrobe.rests()])
     return atlas, motion_atlas, points, Persons(rest=rests), tables
+
+
+def _shapes(wardrobe: Wardrobe, name: str) -> list[Float[Array, " shapes"]]:
+    """Shape parameters of the person who wears each garment of a template."""
+    worn = {number: o for (t, o), number in wardrobe.numbers.items() if t == name}
+    outfits = (worn[k] for k in range(len(wardrobe.garments[name])))
+    return [person_shape(() if o is None else o.shape) for o in outfits]
 
 
 def _padded(values: Array | np.ndarray, count: int) -> np.ndarray:

@@ -1,5 +1,6 @@
 """The training loop: resumable and logged; the result is a predictor."""
 
+import dataclasses
 import json
 import pathlib
 import time
@@ -24,9 +25,7 @@ from ..data import (
 from ..devices import at_home, make_mesh, own_rows, repeated, split
 from ..errors import PhysXNetError
 from ..files import append_line, atomic_write, claims
-from ..models import (
-    Predictor,
-)
+from ..models import Predictor, load_predictor
 from ._checkpoint import Checkpoints, config_json
 from ._config import TrainConfig
 from ._data import TrainingData, load_data
@@ -73,13 +72,20 @@ def train(
 
     Raises:
         BusyError: Another process trains in the folder.
-        PhysXNetError: Too many consecutive non-finite updates, or the folder holds another run.
+        PhysXNetError: Too many consecutive non-finite updates, the folder holds another run, or
+            ``config.start`` is another model.
         FormatError: No usable data for training or validation.
     """
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = make_mesh(config.batch, devices)
     data = load_data(config, sequences)
+    if config.start:
+        before = load_predictor(config.start)
+        if before.config != config.model:
+            raise PhysXNetError(f"start: {config.start} is another model than that of the run.")
+        data = dataclasses.replace(data, normalisation=before.normalisation)
+        network = nnx.merge(before.graph, before.state) if network is None else network
     total = data.frames.steps_per_epoch * config.epochs
     problem, first = make_problem(
         config,

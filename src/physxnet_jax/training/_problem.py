@@ -75,6 +75,8 @@ class LossInputs:
         means: Means of ``vertices`` over patches of 8 cm, of ``vertex_target``, and the weights of
             the patches, where every sample has a garment of its own; else None.
         differences: The same of differences along edges.
+        elastic: Elastic energy of the predicted cloth over that of lifting it by 1 cm, in units
+            in which an error of 1 cm is 1, shape [batch]; None if it doesn't count.
         atlas: The atlas of the maps.
     """
 
@@ -89,6 +91,7 @@ class LossInputs:
     edges: Array | None
     means: tuple[Array, Array, Array] | None
     differences: tuple[Array, Array, Array] | None
+    elastic: Float[Array, " batch"] | None
     atlas: Atlas
 
 
@@ -138,7 +141,7 @@ def configured_loss(config: TrainConfig) -> Loss:
     """The loss that a configuration describes.
 
     Args:
-        config: Its ``loss``, ``pyramid_levels``, ``vertex_share`` and ``edge_share`` count.
+        config: Its ``loss``, ``pyramid_levels``, ``elastic_weight`` and shares count.
     """
     distance = masked_l2 if config.loss == "l2" else masked_l1
 
@@ -156,6 +159,9 @@ def configured_loss(config: TrainConfig) -> Loss:
                     ours, theirs, each = found
                     part = vertex_distance(ours, theirs, each * weight, squared=squared)
                     total = (1.0 - share) * total + share * part
+            if config.elastic_weight and x.elastic is not None:
+                count = jnp.maximum(jnp.sum(x.weight), 1.0)
+                total = total + config.elastic_weight * jnp.sum(x.weight * x.elastic) / count
             return total
         if config.pyramid_levels == 1:
             at_texels = distance(x.texels, x.target, x.valid, x.weight)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 
 from ..data import QUANTIZATION_STEP
 from ..models import clip_features, normalise
-from ._garment_tables import GarmentTables
+from ._garment_tables import ERROR_UNIT, GarmentTables
 from ._losses import (
     adversarial_loss,
     discriminator_loss,
@@ -65,6 +65,7 @@ def _prepare(problem: Problem, batch: Batch) -> tuple[Array, dict[str, Array], d
 def _loss_inputs(
     problem: Problem, t: str, maps: Array, targets: dict[str, Array], batch: Batch
 ) -> LossInputs:
+    scale = problem.normalisation.offset[t]
     valid, table = problem.texel_points.valid[t], problem.tables[t]
     texels = problem.atlas.from_map(maps)
     seen = jnp.where(valid[None, :, None], texels, 0.0)
@@ -72,13 +73,22 @@ def _loss_inputs(
     if isinstance(table, GarmentTables):
         garment = batch[f"garment_{t}"]
         vertices, present, edges = table.sample(seen, garment), table.present[garment], None
-        scaled = stored / problem.normalisation.offset[t]
+        scaled = stored / scale
+        place = problem.config.model.templates.index(t)
+        elastic = table.elastic_energy(
+            scale * vertices,
+            garment,
+            batch["rotations"][:, place, -1],
+            batch["translations"][:, place, -1],
+        )
+        # Errors are relative to the scale.
+        elastic = None if elastic is None else elastic * ERROR_UNIT / scale
         means, differences = (
             (found(vertices, garment)[0], *found(scaled, garment))
             for found in (table.means, table.differences)
         )
     else:
-        means, differences = None, None
+        means, differences, elastic = None, None, None
         vertices, edges = table.bound.sample(seen), table.edges
         present = jnp.ones(vertices.shape[:2], jnp.float32)
     return LossInputs(
@@ -88,11 +98,12 @@ def _loss_inputs(
         valid=valid,
         weight=batch[f"weight_{t}"],
         vertices=vertices,
-        vertex_target=stored / problem.normalisation.offset[t],
+        vertex_target=stored / scale,
         present=present,
         edges=edges,
         means=means,
         differences=differences,
+        elastic=elastic,
         atlas=problem.atlas,
     )
 
