@@ -10,9 +10,10 @@ Result:  experiments/results/losses.json and .md: each default garment's decoder
          vertices: L1 at vertices. patches: half of it at means over patches, the shipped recipe.
          potential: means alone, and the simulator's incremental potential for the rest.
          patches+potential: both errors and a little of the potential.
-         patches+elastic: both errors and the elastic part of it, which needs no frame before.
+         patches+elastic: both errors and the elastic part of it, which needs no frame before; once
+         more with a third of its weight.
          adversarial: L1 at vertices and the paper's discriminator, which sees maps of cloth cast
-         to the texels.
+         to the texels, and the encoder's features in place of maps of motion.
 """
 
 import argparse

@@ -147,6 +147,14 @@ def test_simulation_page_holds_the_measured_tables():
         assert block and block.group(1) == (ROOT / f"experiments/results/{name}.md").read_text()
 
 
+def test_networks_page_holds_the_measured_tables():
+    text = (ROOT / "docs/networks.md").read_text()
+    for name in ("losses", "guided"):
+        block = re.search(rf"<!-- begin {name} -->\n(.*?)<!-- end {name} -->", text, re.S)
+        measured = (ROOT / f"experiments/results/{name}.md").read_text()
+        assert block and block.group(1).strip() == measured.strip()
+
+
 def test_simulation_page_tables_match_the_measurements():
     measured = (ROOT / "experiments/results/sim_bench.md").read_text()
     solvers = ("| xpbd", "| bdf2", "| backward", "| verlet", "| blender", "| newton")

@@ -27,6 +27,13 @@ def test_equal_cloth_is_alike_in_everything(moving):
     assert (found.folds, found.tension, found.jerk) == (1.0, 1.0, 1.0)
 
 
+def test_ratios_to_nothing_are_nan(moving):
+    assembly, x = moving
+    still = np.repeat(np.asarray(assembly.rest)[None], 5, axis=0).astype(np.float32)
+    found = likeness(assembly, x[:5], still, fps=30.0)
+    assert np.isnan(found.jerk) and np.isfinite(found.rmse_mm)
+
+
 def test_each_fault_shows_in_its_measure(moving):
     assembly, x = moving
     aside = likeness(assembly, x + np.float32([0.01, 0.0, 0.0]), x, fps=30.0)

@@ -89,10 +89,10 @@ def test_method_suffixes_round_trip_through_options():
     assert both == Inference(weights="nano", tta=True)
     for name in ("nano", "nano+mirror", "nano+relax", "nano+mirror+relax+push", "base+push"):
         assert method_name(parse_method(name)) == name
-    options = MethodProfile("nano+mirror+relax+push", {}, {}).options
+    options = MethodProfile("nano+mirror+relax+push", {}, {}, {}).options
     assert options == {"method": "network", "inference": both}
     names = ("nano", "nano+mirror", "nano+relax", "nano+mirror+push")
-    assert len({MethodProfile(n, {}, {}).identity for n in names}) == len(names)
+    assert len({MethodProfile(n, {}, {}, {}).identity for n in names}) == len(names)
 
 
 def test_wrong_options_are_refused():

@@ -133,6 +133,7 @@ def test_share_of_patches_weighs_both_parts():
         ({"patch_share": 2.0}, "from 0 to 1"),
         ({"patch_share": 0.5}, "conditions"),
         ({"elastic_weight": 0.5}, "conditions"),
+        ({"elastic_weight": 1.0, "model": MODEL, "adversarial": False, "loss": "l2"}, "loss='l1'"),
         ({"elastic_weight": -1.0, "model": MODEL, "adversarial": False}, "elastic_weight"),
     )
     for given, says in wrong:

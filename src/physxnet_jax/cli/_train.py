@@ -7,7 +7,7 @@ from rich.console import Console
 
 from ..data import CARD, list_entries, read_note
 from ..devices import join_processes
-from ..models import save_predictor
+from ..models import read_card, save_predictor
 from ..training import TrainConfig, read_metrics, train as run
 from ._configs import config_name, read_config
 from ._experiment_commands import Train
@@ -69,6 +69,11 @@ def train(command: Train, console: Console) -> int:
                     "best_step": int(min(measured, key=lambda x: x["validation_mm"])["step"]),
                 }
                 if config.validation and measured
+                else {}
+            ),
+            **(
+                {"start": config.start, "start_sha256": read_card(config.start)["sha256"]}
+                if config.start
                 else {}
             ),
             "mirrored too": config.mirror_augmentation,

@@ -44,7 +44,7 @@ _SUBSTEPS = 8
 _CONVERGED = 128
 # Rate for which a scene is prepared [1/s]; for others it is prepared again within the call.
 _RATE = 30.0
-# Time constant of the guide [s]: a longer one lets cloth slide that more substeps would hold.
+# Time constant of the guide [s]: with a longer one trousers slide down, at any number of substeps.
 _TIME_CONSTANT = 0.02
 # Distance between the middles of patches [m]: nearer ones pass on the network's own noise.
 _SPACING = 0.12

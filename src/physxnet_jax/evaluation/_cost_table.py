@@ -4,10 +4,13 @@ import dataclasses
 import functools
 import importlib.resources
 import json
+import math
 import pathlib
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+
+import jax
 
 from .._environment import cache_folder
 from .._version import __version__
@@ -28,8 +31,9 @@ _FRAMES = 64
 _SECONDS = 0.5
 # Times with another value of this marker were measured differently and are discarded.
 _TIMING_VERSION = "tailored garments together, each profile as a whole"
-# A profile is timed for a limit if it is expected to take at most this many times as long.
-_DOUBT = 1.5
+# A profile is timed for a budget if it is expected to take at most so many times as long: where one
+# of its kind has been timed here, and where none has.
+_DOUBT, _DOUBT_OF_KIND = 1.5, 4.0
 ALONE_AND_TOGETHER: tuple[tuple[Template, ...], ...] = (*((t,) for t in TEMPLATES), TEMPLATES)
 """Each template alone, and all of them together."""
 
@@ -53,6 +57,23 @@ class MethodProfile:
     rmse_mm: dict[str, float]
     inside: dict[str, float]
     usual_ms: dict[str, float]
+
+    @property
+    def kind(self) -> str:
+        """Profiles of a kind are faster or slower on a machine by about the same ratio."""
+        return self.name if self.name == "lbs" else self.options["method"]
+
+    def __post_init__(self) -> None:
+        usual = self.usual_ms
+        if set(usual) != set(self.rmse_mm) or not all(x > 0 for x in usual.values()):
+            raise ValueError(f"{self.name}: usual_ms needs a positive time for each of rmse_mm.")
+
+    def rank(self, templates: Sequence[str]) -> tuple[float, float]:
+        """Key that is least for the most accurate profile.
+
+        If errors are equal to a tenth of a millimetre, fewer vertices inside win.
+        """
+        return round(self.error_mm(templates), 1), sum(self.inside[t] for t in templates)
 
     @property
     def options(self) -> dict[str, Any]:
@@ -206,8 +227,9 @@ def choose_method(
     """`select_method`, timing on this machine only the profiles that matter.
 
     Profiles without a time here are expected to take their `MethodProfile.usual_ms`, times the
-    ratio that those with one have shown. With a budget the most accurate profile that may fit is
-    timed, until one fits; with an error the one that may be fastest, until it is.
+    ratio that those of their kind have shown. With a budget the most accurate profile that may fit
+    is timed, until one fits: on a CPU those that are expected to take up to four times as long,
+    elsewhere all. With an error the one that is expected to be fastest is timed, until it is.
 
     Args:
         templates: Template of each garment to wear.
@@ -216,7 +238,7 @@ def choose_method(
         max_error_mm: Largest mean error over the garments [mm].
         path: File of the cached times; `calibration_file` by default.
         frames: Number of frames of the built-in walk that are dressed.
-        report: Called with a text, the profiles timed and the number of all.
+        report: Called with a text, the profiles timed and that number with the next.
 
     Raises:
         PhysXNetError: No profile is that fast or that accurate; the text names the nearest.
@@ -225,25 +247,31 @@ def choose_method(
     clock = _Clock(calibration_file() if path is None else path, frames)
     key = worn_key(templates)
     able = [r for r in profiles if all(t in r.rmse_mm for t in templates)]
+    # What is usual is so on a CPU.
+    doubt = _DOUBT_OF_KIND if jax.default_backend() == "cpu" else math.inf
 
     def known() -> dict[str, float]:
         """Times of the profiles that have one here."""
         found = {r.name: clock.times.get(r.identity, {}).get(key) for r in able}
         return {name: ms for name, ms in found.items() if ms is not None}
 
-    def expected() -> dict[str, float]:
+    def expected() -> dict[str, tuple[float, float]]:
+        """For each profile its expected time, and how many times as short it may be."""
         usual = {r.name: sum(r.usual_ms[t] for t in templates) for r in able}
-        here = known()
-        ratio = statistics.median([here[n] / usual[n] for n in here] or [1.0])
-        return {n: here.get(n, ratio * ms) for n, ms in usual.items()}
+        here, kinds = known(), {r.name: r.kind for r in able}
+        out = {}
+        for name, ms in usual.items():
+            ratios = [here[n] / usual[n] for n in here if kinds[n] == kinds[name]]
+            times = ms * statistics.median(ratios or [1.0])
+            out[name] = (times, _DOUBT if ratios else doubt)
+        return out | {name: (ms, 1.0) for name, ms in here.items()}
 
     while able:
-        here, guess = known(), expected()
+        here, found = known(), expected()
+        guess = {name: ms for name, (ms, _) in found.items()}
         if budget_ms is not None:
-            fits = [
-                r for r in able if guess[r.name] <= budget_ms * (1.0 if r.name in here else _DOUBT)
-            ]
-            best = min(fits, key=lambda r: r.error_mm(templates), default=None)
+            fits = [r for r in able if guess[r.name] <= budget_ms * found[r.name][1]]
+            best = min(fits, key=lambda r: r.rank(templates), default=None)
         else:
             fits = [r for r in able if r.error_mm(templates) <= (max_error_mm or 0.0)]
             best = min(fits, key=lambda r: guess[r.name], default=None)
@@ -255,7 +283,7 @@ def choose_method(
         if best.name in here:
             break
         if report is not None:
-            report(f"timing {best.name}, {', '.join(templates)}", len(here), len(able))
+            report(f"timing {best.name}, {', '.join(templates)}", len(here), len(here) + 1)
         clock.time_of(best, templates)
     return select_method(
         templates,
@@ -304,12 +332,7 @@ def select_method(
         raise PhysXNetError(f"no profile has a time and an error for {', '.join(templates)}.")
     if budget_ms is not None:
         within = [r for r in candidates if cost(r) <= budget_ms]
-        # If errors are equal to a tenth of a millimetre, fewer vertices inside win.
-        best = min(
-            within,
-            key=lambda r: (round(error(r), 1), sum(r.inside[t] for t in templates)),
-            default=None,
-        )
+        best = min(within, key=lambda r: r.rank(templates), default=None)
         nearest = min(candidates, key=cost)
         asked = f"{budget_ms:g} ms a frame"
     else:

@@ -1,6 +1,7 @@
 """How like a simulation cloth is, in position, folds, strain and motion."""
 
 import dataclasses
+import math
 
 import numpy as np
 from jaxtyping import Float
@@ -50,6 +51,8 @@ def likeness(
 ) -> Likeness:
     """Compares cloth with a reference.
 
+    Ratios are NaN where the reference has none of it.
+
     Args:
         assembly: The garment alone, from `prepare_scene`.
         cloth: Positions [m].
@@ -64,9 +67,13 @@ def likeness(
     found, wanted = (fold_spectrum(assembly.rest, faces, x[::_STRIDE]) for x in (cloth, reference))
     return Likeness(
         rmse_mm=vertex_error(cloth, reference).rmse_mm,
-        folds=fold_strength(faces, cloth) / fold_strength(faces, reference),
+        folds=_ratio(fold_strength(faces, cloth), fold_strength(faces, reference)),
         wrinkle_deg=wrinkle_error(faces, cloth, reference),
         spectrum=spectrum_distance(found, wanted),
-        tension=tension(cloth) / tension(reference),
-        jerk=jitter(cloth, fps) / jitter(reference, fps),
+        tension=_ratio(tension(cloth), tension(reference)),
+        jerk=_ratio(jitter(cloth, fps), jitter(reference, fps)),
     )
+
+
+def _ratio(of: float, over: float) -> float:
+    return of / over if over > 0.0 else math.nan

@@ -271,7 +271,7 @@ def a_strain_limit_in_a_storm() -> Iterator[tuple[str, float, float]]:
     free, held = (simulate_batch(Scene(garments, e), [m])[0] for e in (storm, limited))
     most = [float(out.diagnostics["strain_p99"].max()) for out in (held, free)]
     yield NOT_FINITE, 0, bad_frames(held)
-    yield "99 % of edges, most strain over that without a limit (1)", 1.0, most[0] / most[1]
+    yield "99 % of edges, most strain over that without a limit (1)", 0.9, most[0] / most[1]
 
 
 def one(name: Template) -> Callable[[], tuple[Garment, ...]]:

@@ -39,7 +39,7 @@ class TrainConfig:
             ``model.conditions``.
         elastic_weight: Weight of the cloth's elastic energy, relative to lifting the garment by
             1 cm, beside an error of 1 cm: what an error lets open between neighbouring vertices,
-            the energy of springs and hinges closes. Only with ``model.conditions``.
+            the energy of springs and hinges closes. Only with ``model.conditions`` and ``l1``.
         pyramid_levels: The loss at texels is the mean over this many resolutions of maps, each
             half the previous one; 1 is the paper's.
         adversarial: Whether to train with a discriminator.
@@ -110,6 +110,8 @@ class TrainConfig:
             raise ValueError("patch_share needs model.conditions.")
         if self.elastic_weight and not self.model.conditions:
             raise ValueError("elastic_weight needs model.conditions.")
+        if self.elastic_weight and self.loss != "l1":
+            raise ValueError(f"elastic_weight needs loss='l1', but loss is '{self.loss}'.")
         if self.model.conditions and self.adversarial:
             raise ValueError(
                 "conditions: every sample has a garment of its own, whose vertices alone are"

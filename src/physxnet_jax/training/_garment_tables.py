@@ -39,9 +39,9 @@ class GarmentTables:
         share: Their shares in the vertex, shape [garments, vertices, m].
         patches: Number of patches of the garment that has most.
         edges: Vertices of each edge, shape [garments, edges, 2]; padding joins vertex 0 to itself.
-        rest: Vertices at rest [m], shape [garments, vertices, 3].
-        skin: Their skinning weights, shape [garments, vertices, joints].
-        elastic: Springs and hinges; None where their energy doesn't count.
+        elastic: Vertices at rest [m], shape [garments, vertices, 3], their skinning weights, shape
+            [garments, vertices, joints], and springs and hinges; None where their energy doesn't
+            count.
     """
 
     texel: Int[Array, "garments vertices k"]
@@ -51,9 +51,7 @@ class GarmentTables:
     patch: Int[Array, "garments vertices m"]
     share: Float[Array, "garments vertices m"]
     edges: Int[Array, "garments edges 2"]
-    rest: Float[Array, "garments vertices 3"]
-    skin: Float[Array, "garments vertices joints"]
-    elastic: ElasticTables | None
+    elastic: tuple[Array, Array, ElasticTables] | None
     patches: int = dataclasses.field(metadata={"static": True})
 
     def differences(
@@ -94,14 +92,14 @@ class GarmentTables:
             rotations: World rotations of joints.
             translations: World translations of joints [m].
         """
-        elastic = self.elastic
-        if elastic is None:
+        if self.elastic is None:
             return None
+        every = self.elastic
 
         def one(o: Array, g: Array, r: Array, t: Array) -> Array:
-            points, blend = skin_points(self.rest[g], self.skin[g], r, t)
+            rest, skin, mine = jax.tree.map(lambda x: x[g], every)
+            points, blend = skin_points(rest, skin, r, t)
             turned = jnp.einsum("vab,vb->va", polar_rotation(blend), o, precision="highest")
-            mine = jax.tree.map(lambda x: x[g], elastic)
             return mine.energy(points + turned) / mine.lift(ERROR_UNIT)
 
         return jax.vmap(one)(offsets, garment, rotations, translations)
@@ -173,10 +171,6 @@ def prepare_garments(
             for g in garments
         ]
         edges = [mesh_edges(np.asarray(g.mesh.faces)).vertices for g in garments]
-        shapes = _shapes(wardrobe, name)
-        rests = [
-            g.rest_vertices(body.rest_vertices(s)) for g, s in zip(garments, shapes, strict=True)
-        ]
         tables[name] = GarmentTables(
             texel=jnp.asarray(np.stack([_padded(b.texel, count) for b in bound])),
             weight=jnp.asarray(np.stack([_padded(b.weight, count) for b in bound])),
@@ -189,9 +183,7 @@ def prepare_garments(
             edges=jnp.asarray(
                 np.stack([_padded(e, max(map(len, edges))) for e in edges]).astype(np.int32)
             ),
-            rest=jnp.asarray(np.stack([_padded(r, count) for r in rests])),
-            skin=jnp.asarray(np.stack([_padded(g.skin, count) for g in garments])),
-            elastic=elastic_tables(garments, shapes) if elastic else None,
+            elastic=_elastic(wardrobe, name) if elastic else None,
             patches=max(int(i.max()) + 1 for i, _ in shares),
         )
     points = make_texel_points(motion_atlas, body, rest, valid)
@@ -199,11 +191,19 @@ def prepare_garments(
     return atlas, motion_atlas, points, Persons(rest=rests), tables
 
 
-def _shapes(wardrobe: Wardrobe, name: str) -> list[Float[Array, " shapes"]]:
-    """Shape parameters of the person who wears each garment of a template."""
+def _elastic(wardrobe: Wardrobe, name: str) -> tuple[Array, Array, ElasticTables]:
+    """Each garment of a template on the person who wears it, with its springs and hinges."""
+    garments, body = wardrobe.garments[name], load_body()
     worn = {number: o for (t, o), number in wardrobe.numbers.items() if t == name}
-    outfits = (worn[k] for k in range(len(wardrobe.garments[name])))
-    return [person_shape(() if o is None else o.shape) for o in outfits]
+    outfits = (worn[k] for k in range(len(garments)))
+    shapes = [person_shape(() if o is None else o.shape) for o in outfits]
+    count = wardrobe.num_vertices(name)
+    rests = [g.rest_vertices(body.rest_vertices(s)) for g, s in zip(garments, shapes, strict=True)]
+    rest, skin = (
+        jnp.asarray(np.stack([_padded(x, count) for x in rows]))
+        for rows in (rests, [g.skin for g in garments])
+    )
+    return rest, skin, elastic_tables(garments, shapes)
 
 
 def _padded(values: Array | np.ndarray, count: int) -> np.ndarray:

@@ -25,7 +25,7 @@ from ..data import (
 from ..devices import at_home, make_mesh, own_rows, repeated, split
 from ..errors import PhysXNetError
 from ..files import append_line, atomic_write, claims
-from ..models import Predictor, load_predictor
+from ..models import Predictor, load_predictor, read_card
 from ._checkpoint import Checkpoints, config_json
 from ._config import TrainConfig
 from ._data import TrainingData, load_data
@@ -34,6 +34,14 @@ from ._problem import Loss, Problem, TrainState, make_problem
 from ._step import eval_step, train_step
 
 _Report = Callable[[int, int, dict[str, float]], None]
+
+
+def _going_on(data: TrainingData, before: Predictor) -> TrainingData:
+    """The data at the scales of weights, with the texels of the garments that these have seen."""
+    points, old = data.texel_points, before.texel_points.valid
+    valid = {t: seen | old[t] if t in old else seen for t, seen in points.valid.items()}
+    points = dataclasses.replace(points, valid=valid)
+    return dataclasses.replace(data, normalisation=before.normalisation, texel_points=points)
 
 
 # Processes of one run share its folder.
@@ -79,13 +87,15 @@ def train(
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
     mesh = make_mesh(config.batch, devices)
+    before = load_predictor(config.start) if config.start else None
+    if before is not None and (before.config != config.model or network is not None):
+        raise PhysXNetError(f"start: {config.start} is another model than that of the run.")
     data = load_data(config, sequences)
-    if config.start:
-        before = load_predictor(config.start)
-        if before.config != config.model:
-            raise PhysXNetError(f"start: {config.start} is another model than that of the run.")
-        data = dataclasses.replace(data, normalisation=before.normalisation)
-        network = nnx.merge(before.graph, before.state) if network is None else network
+    identity = data.frames.identity
+    if before is not None:
+        data = _going_on(data, before)
+        network = nnx.merge(before.graph, before.state)
+        identity += f" from {read_card(config.start)['sha256']}"
     total = data.frames.steps_per_epoch * config.epochs
     problem, first = make_problem(
         config,
@@ -101,7 +111,7 @@ def train(
         loss=loss,
         optimizer=optimizer,
     )
-    _check_same_run(folder / "config.json", config_json(config, data.frames.identity))
+    _check_same_run(folder / "config.json", config_json(config, identity))
     run = _Run(folder, repeated(mesh, problem), repeated(mesh, first), data, total, mesh)
     try:
         run.train(total if steps is None else min(steps, total), report)
