@@ -44,8 +44,9 @@ _SUBSTEPS = 8
 _CONVERGED = 128
 # Rate for which a scene is prepared [1/s]; for others it is prepared again within the call.
 _RATE = 30.0
-# Time constant of the guide [s]: with a longer one trousers slide down, at any number of substeps.
-_TIME_CONSTANT = 0.02
+# Time constant of the guide for each substep a frame, and at most [s]: with a longer one trousers
+# slide down.
+_TIME_CONSTANT, _LONGEST = 0.0025, 0.02
 # Distance between the middles of patches [m]: nearer ones pass on the network's own noise.
 _SPACING = 0.12
 # Distance of a patch from its prediction at which the cloth starts anew [m].
@@ -141,7 +142,9 @@ def prepare_guided(
     substeps = simulation.substeps or _SUBSTEPS
     solver = dataclasses.replace(simulation, substeps=substeps).solver
     given = [e for e in simulation.effects or () if isinstance(e, Guide)]
-    guide = given or [Guide(spacing=_SPACING, time_constant=_TIME_CONSTANT)]
+    guide = given or [
+        Guide(spacing=_SPACING, time_constant=min(_TIME_CONSTANT * substeps, _LONGEST))
+    ]
     # Effects that are given are taken as they are.
     contact = _contact(len(outfit.garments)) if simulation.effects is None else ()
     scene = build_scene(outfit.garments, outfit.body, shape, simulation, (*guide, *contact))
