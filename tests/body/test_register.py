@@ -7,8 +7,16 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from physxnet_jax.body import clothed_vertices, linear_blend_skinning, register_body, t_pose
+from physxnet_jax.body import (
+    _register,
+    clothed_vertices,
+    linear_blend_skinning,
+    register_body,
+    t_pose,
+)
+from physxnet_jax.body._scan import Scan
 from physxnet_jax.errors import MeshError
+from physxnet_jax.geometry import closest_points, make_mesh
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +58,35 @@ def test_registration_recovers_another_body_vertex_by_vertex(body, stranger):
     np.testing.assert_allclose(twice[0], found.posed, atol=1e-6)
     np.testing.assert_allclose(twice[1], 2 * found.posed + 1, atol=1e-5)
     assert seen[-1][1] == seen[-1][2] and [t[1] for t in seen] == list(range(1, len(seen) + 1))
+
+
+@pytest.mark.parametrize("drawn", [True, False])
+def test_surface_reaches_what_protrudes(body, drawn, monkeypatch):
+    rest = body.rest_vertices(body.default_shape())
+    world, shift = body.transforms(rest, body.a_pose(), jnp.zeros(3))
+    n = 13380
+    x0 = np.asarray(linear_blend_skinning(rest[:n], body.weights[:n], world, shift))
+    x = x0.astype(np.float64)
+    # The chest of a stylised character.
+    for side in (-1, 1):
+        away = np.linalg.norm(x0 - np.asarray(x0[_chest(x0, side)]) + [0, 0, 0.08], axis=1)
+        x += np.maximum(1.0 - (away / 0.13) ** 2, 0.0)[:, None] * [side * 0.02, -0.03, 0.11]
+    faces = np.asarray(body.rest_mesh().faces)
+    if not drawn:
+        monkeypatch.setattr(_register, "_drawn", lambda x, n, _: (np.zeros(len(x)), 0.0 * x))
+    parts = (np.asarray(v) for v in (rest, world, shift))
+    found = _register._project_to_surface(body, Scan(x, faces), *parts)
+    met = closest_points(make_mesh(found.posed, faces), jnp.asarray(x, jnp.float32))
+    apart = np.sqrt(np.asarray(met.squared_distance))[clothed_vertices(body)]
+    assert (apart.max() < 0.025) == drawn, apart.max()
+
+
+def _chest(x, side):
+    """The foremost vertex of a breast."""
+    height = (x[:, 1] - x[:, 1].min()) / np.ptp(x[:, 1])
+    rows = np.flatnonzero((height > 0.7) & (height < 0.76) & (side * x[:, 0] > 0.04))
+    rows = rows[np.abs(x[rows, 0]) < 0.13]
+    return rows[x[rows, 2].argmax()]
 
 
 @pytest.mark.release

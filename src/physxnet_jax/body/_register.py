@@ -43,7 +43,7 @@ _LONGEST_STEP, _SHAPES = 0.4, (-0.5, 1.3)
 _SLIDE = 0.7
 # Cost of differences along an edge in each step, relative to that of a vertex's distance. A
 # displacement spreads over about the square root of it in edges, which are about 1 cm long.
-_STIFFNESS = (60.0, 25.0, 10.0, 4.0, 2.0)
+_STIFFNESS = (60.0, 25.0, 10.0, 4.0, 2.0, 1.0, 1.0)
 # Surfaces farther apart than this, or facing away, aren't matched [m].
 _REACH = 0.12
 # Largest mean distance between the surfaces of a successful registration [m].
@@ -317,8 +317,11 @@ def _project_to_surface(
         if k == 0:
             near = np.minimum(distance, 0.3)
         sure = (distance < _REACH).astype(float)
-        pull = sp.diags(sure + 1e-6) + stiffness * laplacian
-        x = x + splu(pull.tocsc()).solve(sure[:, None] * (target.points[row] - x)).astype(x.dtype)
+        # What protrudes is no vertex's nearest point: the surface pulls, too.
+        drawn, there = _drawn(x, n, target)
+        pull = sp.diags(sure + drawn + 1e-6) + stiffness * laplacian
+        goal = sure[:, None] * (target.points[row] - x) + drawn[:, None] * there
+        x = x + splu(pull.tocsc()).solve(goal).astype(x.dtype)
     met = float(np.mean(near[clothed_vertices(body)]))
     if met > _MAX_MEAN_DISTANCE:
         raise MeshError(
@@ -342,6 +345,18 @@ def _project_to_surface(
         np.minimum(near, _REACH),
         sure,
     )
+
+
+def _drawn(
+    x: np.ndarray, n: np.ndarray, target: Scan
+) -> tuple[Float[np.ndarray, " vertices"], Float[np.ndarray, "vertices 3"]]:
+    """Vertices that are nearest to some of the surface, 1 or 0, and the mean way to it [m]."""
+    row, distance = nearest_facing(KDTree(x), n, target.points, target.normals)
+    near = distance < _REACH
+    count = np.bincount(row[near], minlength=len(x))
+    way = np.zeros(x.shape)
+    np.add.at(way, row[near], target.points[near] - x[row[near]])
+    return (count > 0).astype(float), way / np.maximum(count, 1)[:, None]
 
 
 def clothed_vertices(body: Body) -> Bool[np.ndarray, " vertices"]:

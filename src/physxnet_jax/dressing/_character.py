@@ -13,7 +13,7 @@ from scipy.spatial import KDTree
 from ..body import Body, clothed_vertices, load_body, register_body, skin_points
 from ..errors import FormatError, MeshError
 from ..garment import Garment, SkinnedGarment
-from ..geometry import map_frames
+from ..geometry import bridge_hollows, map_frames
 from ..io import AnimatedMesh, GltfFile, smooth_normals, write_dressed_rig
 from ..motion import (
     BLOCK,
@@ -304,10 +304,16 @@ def write_dressed_character(
 
 
 def bind_to_character(garment: Garment, character: Character) -> Garment:
-    """Transfers a garment from the built-in body to the character's proportions."""
+    """Transfers a garment from the built-in body to the character's proportions.
+
+    Hollows of the character that the built-in body lacks are bridged.
+    """
     rest = character.body.rest_vertices(character.body.default_shape())
-    mesh = dataclasses.replace(garment.mesh, vertices=garment.rest_vertices(rest))
-    return dataclasses.replace(garment, mesh=mesh)
+    carried, made = garment.rest_vertices(rest), np.asarray(garment.mesh.vertices)
+    taut = bridge_hollows(np.asarray(carried), made, np.asarray(garment.mesh.faces))
+    taut = jnp.asarray(taut)
+    mesh = dataclasses.replace(garment.mesh, vertices=taut)
+    return dataclasses.replace(garment, mesh=mesh, offset=garment.offset + (taut - carried))
 
 
 def apply_residual(

@@ -1,6 +1,7 @@
 """Triangle meshes and geometric queries, independent of bodies and garments."""
 
 from ._barycentric import interpolate as interpolate
+from ._bridge import bridge_hollows as bridge_hollows
 from ._candidates import nearby_faces as nearby_faces, spread_points as spread_points
 from ._closest import (
     closest_among as closest_among,
