@@ -95,7 +95,7 @@ def test_impossible_numbers_are_refused():
     assert join_processes() == 0
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_two_devices_learn_what_one_learns(tmp_path):
     finish(start(tmp_path / "one"), start(tmp_path / "two", devices=2))
     one, two = weights(tmp_path / "one"), weights(tmp_path / "two")
@@ -105,7 +105,7 @@ def test_two_devices_learn_what_one_learns(tmp_path):
     assert np.abs(one - weights(tmp_path / "adam")).max() > 1e-5
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_two_processes_learn_what_one_learns_and_resume_on_one_device(tmp_path):
     port = free_port()
     finish(
@@ -211,7 +211,7 @@ assert build_dataset(config, folder / "set", mocap) == 3
 """
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_people_and_datasets_are_simulated_the_same_on_two_devices(tmp_path):
     found = []
     for devices in (1, 2):

@@ -119,7 +119,7 @@ def test_rows_are_complete_and_measured_once(tiny, tmp_path, capsys):
     assert (tmp_path / "net.md").is_file() and (tmp_path / "net.png").is_file()
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 @pytest.mark.usefixtures("hasty")
 def test_evaluated_errors_are_copied_to_the_rows(tiny, tmp_path):
     error_rows = [

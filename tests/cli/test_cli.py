@@ -205,6 +205,7 @@ def test_memory_that_ends_is_one_sentence(monkeypatch, capsys, tmp_path):
         main(["dress", "walk"])
 
 
+@pytest.mark.release
 def test_a_clip_that_cannot_be_written_for_memory_is_kept(monkeypatch, capsys, tmp_path):
     write = _dress.write_clip
 

@@ -181,6 +181,7 @@ def test_invalid_configurations_are_refused(tmp_path, capsys):
         assert said in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.release
 def test_export_command_writes_a_dresser(tmp_path, capsys):
     pytest.importorskip("flatbuffers")
     out = tmp_path / "dresser"

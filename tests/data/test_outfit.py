@@ -39,6 +39,7 @@ def mocap(tmp_path_factory):
     return folder
 
 
+@pytest.mark.release
 def test_garments_are_cut_for_the_person():
     garments = PAIR.garments()
     assert list(garments) == ["bottom", "top"], "innermost first"
@@ -49,6 +50,7 @@ def test_garments_are_cut_for_the_person():
     assert np.abs(np.asarray(same.offset - garments["top"].offset)).max() > 1e-4
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -88,7 +90,7 @@ def test_every_action_has_its_share_of_the_outfits(mocap, tmp_path, monkeypatch)
     assert sorted(done) == sorted(w for w in wanted if w[0] == "part 2"), "as without only"
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_outfits_are_stored_and_read_again(mocap, tmp_path):
     config = DatasetConfig(
         splits=("train",), outfits=(PAIR, ALONE), outfits_each=1, people=2, solver=XPBD(64, 1)

@@ -242,6 +242,7 @@ def test_damaged_dataset_metadata_is_reported(tmp_path, text):
         open_dataset(tmp_path, {"fps": 30})
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("left", "speed"), [(False, 1.25), (True, 0.8)])
 def test_expected_frames_match_the_built_actions(data_dir, tmp_path, left, speed):
     folder = data_dir / "mocap"

@@ -37,7 +37,7 @@ def test_potential_falls_and_only_the_decoder_of_the_garment_changes(taught):
     assert not any("mean" in k or "var" in k for k in changed)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_an_interrupted_run_resumes_to_the_same_network(taught, tmp_path):
     class Killed(Exception):
         pass

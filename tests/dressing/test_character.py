@@ -112,7 +112,7 @@ def test_inner_garments_stay_beneath_outer_ones_on_a_character(character, monkey
     assert apart.inside["top"] < 0.04
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_network_and_simulation_dress_a_character(man, character):
     shape, clip, _, _ = man
     worn = dress(

@@ -51,7 +51,7 @@ def test_clips_of_other_lengths_are_not_recompiled():
     assert infer_block._cache_size() == programs + 1, "another program is one more"
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_refined_garments_return_on_their_own_vertices_without_skin_through_them():
     """A tube with edges of 10 cm; the control doesn't keep its own triangles off the skin."""
     case = PEER_CASES["edges_of_ten_centimetres"]

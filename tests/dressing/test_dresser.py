@@ -166,6 +166,7 @@ def test_exported_dresser_runs_without_this_package(dresser, whole, motion, tmp_
     assert done.returncode != 0 and "damaged" in done.stderr
 
 
+@pytest.mark.release
 def test_template_binding_is_unchanged_on_a_scaled_body(body):
     large = dataclasses.replace(body, bases=1.15 * body.bases, deltas=1.15 * body.deltas)
     ours, theirs = (

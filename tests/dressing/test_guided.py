@@ -51,6 +51,7 @@ def step(dresser, stream, q, p, fps=30.0):
     return clothe_step(dresser, stream, q, p, fps)
 
 
+@pytest.mark.release
 def test_the_first_frame_is_skinned_cloth_near_the_prediction(guided, motion):
     """Smooth, with its patches where they are predicted; later frames are the simulation's."""
     q, p = motion.rotations[:FRAMES], motion.root[:FRAMES]

@@ -129,6 +129,7 @@ def test_constant_velocity_is_a_fixed_point_after_the_window_is_full(dresser, ju
         assert np.abs(x[-1] - np.asarray(stood[name])[-1]).max() > 1e-4, "speed is seen"
 
 
+@pytest.mark.release
 def test_quaternion_signs_do_not_change_the_cloth(judge, motion):
     _, plain, _, _ = judge(*motion)
     _, flipped, _, _ = judge(*mirrored_quaternions(*motion))

@@ -116,6 +116,7 @@ def test_distance_to_each_template_is_reported(tmp_path, trousers, capsys):
     assert "bottom 0 mm" in capsys.readouterr().out
 
 
+@pytest.mark.release
 def test_fitting_moves_cloth_out_of_the_body(tmp_path, trousers):
     v, faces = trousers
     thin = v * [0.9, 1.0, 0.9]
@@ -125,7 +126,7 @@ def test_fitting_moves_cloth_out_of_the_body(tmp_path, trousers):
     assert after.inside < 0.25 * found.inside
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_misplaced_mesh_is_aligned_to_the_template(tmp_path, trousers):
     v, faces = trousers
     path = saved(tmp_path, "far.obj", 7.3 * v + [40.0, -3.0, 9.0], faces)
@@ -201,6 +202,7 @@ def test_fitted_real_dress_is_reported_ready(data_dir, tmp_path):
     assert found.problems == () and found.template == "dress" and found.inside == 0.0
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", ["top", "bottom", "dress"])
 def test_alignment_recovers_any_axis_and_heading(name):
     """Of a mesh that is the template, turned: to where the template's vertices are."""
@@ -222,7 +224,7 @@ def test_alignment_recovers_any_axis_and_heading(name):
         assert how[:4] in told and ("turned" in told) == ("turned" in how) and off < 0.2
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_floating_garment_is_settled_on_the_body(tmp_path, capsys):
     """A sleeveless top with a wide neck, placed too high, rests on the shoulders in the end."""
     g = template("top")
@@ -256,6 +258,7 @@ def test_floating_garment_is_settled_on_the_body(tmp_path, capsys):
     assert np.median(np.abs(lengths[1] / lengths[0] - 1)) < 0.03
 
 
+@pytest.mark.release
 def test_garment_that_falls_off_is_refused(tmp_path):
     """A ring about the chest, too wide to rest on anything."""
     around = np.linspace(0.0, 2 * np.pi, 40, endpoint=False)

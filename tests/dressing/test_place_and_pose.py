@@ -96,6 +96,7 @@ def test_ten_kilometres_away_the_dressed_person_is_the_same(motion, method):
         np.testing.assert_array_equal(seen, found.garments[0].positions)
 
 
+@pytest.mark.release
 def test_a_stream_follows_a_person_who_walks_away(dresser, motion):
     """Over the distance at which its place moves; without contact, which rounding can switch."""
     dresser = dataclasses.replace(dresser, colliders=None)

@@ -59,7 +59,7 @@ def test_only_simulated_cloth_has_a_fabric(guided):
             )
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_guided_cloth_of_another_shape_is_near_that_of_a_new_dresser(motion):
     """And far from that of the shape before."""
     near = Inference(weights="small")
@@ -138,7 +138,7 @@ def test_gradients_by_pose_shape_cut_and_fabric_match_differences(guided, motion
             assert found[k] != 0.0
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_ease_widens_guided_cloth(guided, motion):
     """The tailor's measure reaches the simulated cloth, with its sign."""
 

@@ -74,6 +74,7 @@ def test_cloth_and_gradients_with_collisions_are_finite(dresser, judge, motion, 
     assert any(np.abs(x).max() > 0 for x in slopes)
 
 
+@pytest.mark.release
 def test_stream_flags_a_non_finite_frame_and_recovers(dresser, motion):
     """Those whose window holds it, and then all is well again."""
     rotations, root = motion

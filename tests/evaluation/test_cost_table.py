@@ -99,6 +99,7 @@ def test_unsatisfiable_requests_are_refused_with_the_nearest_method():
         select_method([], TIMES, RUNGS, budget_ms=5.0)
 
 
+@pytest.mark.release
 def test_times_are_cached_for_each_machine(tmp_path):
     path = tmp_path / "deep" / "times.json"
     profiles, worn = [profile("lbs", 20.0)], [("bottom",), ("top", "bottom")]
@@ -226,6 +227,7 @@ def test_every_packaged_method_can_dress():
         )
 
 
+@pytest.mark.release
 def test_dress_uses_the_selected_method(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(

@@ -76,6 +76,7 @@ def test_existing_rows_are_not_measured_again():
     assert [r.action for r in again] == ["b"] and asked == [24, 20]
 
 
+@pytest.mark.release
 def test_non_finite_frames_are_counted_and_excluded():
     def broken(motion, name):
         x = skinning()(motion, name).positions.copy()
@@ -147,6 +148,7 @@ def test_pose_features_are_invariant_to_position_and_heading(body, rest):
     assert np.abs(a[0] - a[20]).max() > 0.05
 
 
+@pytest.mark.release
 def test_check_detects_explosions_wrong_counts_and_stretched_cloth():
     fine = check_sequence(sequence(), 24)
     assert all(f.holds for f in fine if "inside" not in f.quantity), "skinning is calm cloth"

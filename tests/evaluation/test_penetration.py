@@ -20,6 +20,7 @@ def standing(body, rest):
     return Motion(body.a_pose()[None], root, 30.0)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", ["top", "bottom"])
 def test_rest_cloth_is_outside_and_sunken_cloth_is_inside(body, rest, standing, name):
     assembly = prepare_scene(Scene((template(name),), (Gravity(),))).assembly

@@ -32,7 +32,7 @@ from physxnet_jax.data import (
 )
 from physxnet_jax.dressing import load_scene, read_character
 from physxnet_jax.errors import FormatError, PhysXNetError
-from physxnet_jax.garment import square_sheet
+from physxnet_jax.garment import find_fabric, square_sheet
 from physxnet_jax.io import read_mdd, read_mesh, read_obj, read_pc2
 from physxnet_jax.models import load_predictor
 from physxnet_jax.motion import load_motion, read_amc, read_bvh, read_joint_map
@@ -53,6 +53,8 @@ PLY = (
 MTL = "newmtl red\nKd 1 0 0\nd 0.5\nmap_Kd -s 1 1 1 red.png\n\nnewmtl blue\nKd 0 0 1\nNs 10\n"
 ACTIONS = b"split,action,file,start_s,frames_at_30fps,note\ntrain,walk,a.bvh,0.5,20,x\ntest,run,b.bvh,0,9,\n"
 CLIPS = b"file,fps\na.bvh,120\nb.bvh,60\n"
+FABRIC = 'base = "wool"\ndensity = 0.19\nbend = 3e-5\nwarp = 2600.0\n'
+
 NAMES = 'Hips = "a"\nLeftLeg = "b"\n'
 
 
@@ -394,6 +396,7 @@ READERS = {
     "pc2": (_pc2, ".pc2", read_pc2, 20),
     "mdd": (_mdd, ".mdd", read_mdd, 20),
     "scene": (lambda f: SCENE.encode(), ".toml", load_scene, 20),
+    "fabric": (lambda f: FABRIC.encode(), ".toml", find_fabric, 20),
     "joint map": (lambda f: NAMES.encode(), ".toml", read_joint_map, 20),
     "gltf": (_gltf, ".gltf", load_motion, 20),
     "amass": (_amass, ".npz", load_motion, 20),

@@ -95,6 +95,7 @@ def test_sleeves_follow_the_arms_out_of_a_t_pose(wardrobe):
     assert any(not o.limbs for o in openings(x, loops, bodies["rest"].limbs))
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("kind", ["tee", "shirt"])
 def test_the_low_side_of_a_neckline_is_the_front(kind, wardrobe):
     """Also against the distance from the skin: deepened, the shirt fits either way."""

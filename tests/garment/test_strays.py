@@ -17,6 +17,7 @@ def with_strays(path, where, count):
     return x
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("where", "count"), [((5, 0, 0), 1), ((0, 5, 0), 3), ((0, -3, 2), 3)])
 def test_strays_change_neither_unit_nor_place(where, count, tmp_path, monkeypatch):
     x = with_strays(tmp_path / "a.obj", where, count)

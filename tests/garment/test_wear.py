@@ -1,9 +1,19 @@
 """``NAME[:key=value,...]``: what is worn, as people write it."""
 
+import dataclasses
+
 import pytest
 
-from physxnet_jax.errors import PhysXNetError
-from physxnet_jax.garment import FABRICS, load_garment, parse_wear, template, with_default_fabric
+from physxnet_jax.errors import FormatError, PhysXNetError
+from physxnet_jax.garment import (
+    FABRICS,
+    find_fabric,
+    load_garment,
+    parse_wear,
+    tailor,
+    template,
+    with_default_fabric,
+)
 
 
 @pytest.mark.parametrize(
@@ -27,7 +37,7 @@ def test_words_are_parsed(word, expected):
     [
         ("top:colour=red", "there are as, fabric"),
         ("a.obj:as=hat", "one of top, bottom, dress"),
-        ("top:fabric=tin", "one of cotton"),
+        ("top:fabric=tin", "there are cotton"),
         ("top:ease=0.1", "there are as, fabric"),
         ("tee:as=top", "there are fabric, hold, ease"),
         ("tee:ease=wide", "expected metres, as in ease=0.1"),
@@ -75,3 +85,39 @@ def test_a_garment_is_made_of_the_fabric():
     assert garment.fabric.thickness >= template("bottom").fabric.thickness
     with pytest.raises(PhysXNetError, match="is a template"):
         load_garment("bottom:as=top")
+
+
+def test_fabric_files_are_taken_where_names_are(tmp_path):
+    linen = tmp_path / "linen.toml"
+    linen.write_text('base = "wool"\ndensity = 0.19\nbend = 3e-5\n')
+    found = find_fabric(linen)
+    assert found == dataclasses.replace(FABRICS["wool"], density=0.19, bend=3e-5)
+    assert load_garment(f"top:fabric={linen}")[0].fabric.density == 0.19
+    assert tailor("tee", fabric=str(linen)).fabric.bend == 3e-5
+    assert with_default_fabric(["top"], str(linen)) == (f"top:fabric={linen}",)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("weight = 1.0", "a fabric has no 'weight'"),
+        ("density = nan", "density"),
+        ('density = "thick"', "expected a number"),
+        ('base = "tin"', "no fabric 'tin'"),
+        ("density = ", "tin.toml"),
+        ("#" * 200_000, "too large"),
+    ],
+)
+def test_fabric_files_with_faults_are_refused_by_name(text, match, tmp_path):
+    path = tmp_path / "tin.toml"
+    path.write_text(text)
+    with pytest.raises(FormatError, match=match) as error:
+        parse_wear(f"top:fabric={path}")
+    assert str(path) in str(error.value)
+
+
+def test_fabric_files_that_are_not_there_are_named(tmp_path):
+    with pytest.raises(FormatError, match="No such file"):
+        find_fabric(tmp_path / "none.toml")
+    with pytest.raises(PhysXNetError, match="No fabric 'tin'; there are cotton"):
+        find_fabric("tin")

@@ -108,6 +108,7 @@ def test_gradient_of_the_distance_is_finite_and_correct(sphere):
     assert float(jax.grad(height)(jnp.float32(0.1))) == pytest.approx(-1.0, abs=1e-4)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("reach", [0.02, 0.2, 3.0])
 def test_rays_of_limited_reach_find_what_all_rays_find(reach):
     """Block by block among the triangles in reach, of a body's size and finer."""

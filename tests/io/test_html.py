@@ -94,6 +94,7 @@ def test_foreign_scripts_and_requests_are_stopped(page, tmp_path):
     assert ran == {"held": None, "open": "ran"} and asked == ["/open"]
 
 
+@pytest.mark.release
 @pytest.mark.browser
 @pytest.mark.skipif(_BROWSER["BROWSER"] is None, reason="no Chromium installed")
 def test_html_page_plays_in_a_browser(page, tmp_path):

@@ -161,6 +161,7 @@ def test_quads_split_at_the_shorter_diagonal_and_negative_indices_work(tmp_path)
     assert {1, 3} <= set(mesh.faces[0]) and {1, 3} <= set(mesh.faces[1])
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("unit", "scale"), [("m", 1.0), ("cm", 0.01), ("dm", 0.1), ("mm", 0.001)])
 def test_units_and_axes_are_detected(tmp_path, unit, scale):
     g = template("bottom")
@@ -176,6 +177,7 @@ def test_units_and_axes_are_detected(tmp_path, unit, scale):
         )
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("name", "kind"),
     [

@@ -184,6 +184,7 @@ def test_mesh_without_texture_coordinates_has_only_a_colour(painted):
     assert all(look.texture is not None and look.colour == (1, 1, 1) for look in mesh.looks)
 
 
+@pytest.mark.release
 def test_outside_damaged_or_missing_images_are_reported_and_not_read(painted):
     folder = painted.parent
     (folder.parent / "secret.png").write_bytes(RED)

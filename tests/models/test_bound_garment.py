@@ -67,6 +67,7 @@ def test_gradients_by_the_network_are_finite_and_zero_is_the_skinning(dressed):
     np.testing.assert_allclose(still, skinned, atol=1e-6)
 
 
+@pytest.mark.release
 def test_test_time_augmentation_holds_for_the_chart_of_skirts(dressed):
     predictor, worn, world, shift = dressed
     both = with_mirror_tta(predictor)

@@ -80,6 +80,7 @@ def test_upsampling_equals_a_transposed_convolution_with_its_gradients():
     np.testing.assert_allclose(*map(np.asarray, mixed), atol=2e-3)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("size", [(32, 32), (16, 48)])
 def test_generator_computes_only_the_requested_decoders(size):
     g = Generator(21, ("top", "bottom", "dress"), width=4, rngs=nnx.Rngs(0))
@@ -168,6 +169,7 @@ def test_only_local_features_are_invariant_to_heading(worn, body, rest):
     assert np.abs(out["a", "local"][..., 18:21] - tilted[..., 18:21]).max() > 0.2
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "inputs",
     [
@@ -267,6 +269,7 @@ def predictor(worn, family, zero=False):
     )
 
 
+@pytest.mark.release
 def test_zero_output_of_the_local_family_equals_skinning(worn, body, rest):
     _, _, bound_garments = worn
     r, s = transforms(body, rest)
@@ -394,6 +397,7 @@ def test_bfloat16_and_float64_predictions_are_close_to_float32(worn):
     assert 0.0 < gap < 2e-5 * scale
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("inputs", [LOCAL, PAPER_FAR], ids=["local", "far"])
 def test_test_time_augmentation_makes_predictions_mirror_symmetric(worn, inputs):
     atlas, surface, _ = worn

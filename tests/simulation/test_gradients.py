@@ -168,6 +168,7 @@ def test_bending_stiffness_is_recovered_from_motion(body, rest):
     assert float(jnp.exp(at)) == pytest.approx(3.0, rel=0.05)
 
 
+@pytest.mark.release
 def test_rescaled_friction_matches_a_fabric_of_that_friction(body, rest):
     """The kerchief on a head that tilts: twice the friction told is twice the friction made."""
     skin = np.asarray(rest, np.float64)[:13380]

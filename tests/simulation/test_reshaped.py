@@ -32,6 +32,7 @@ def floats(effect):
     return [x for x in jax.tree.leaves(effect) if jnp.issubdtype(x.dtype, jnp.floating)]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("effects", [EFFECTS, WOVEN], ids=["springs", "membrane"])
 def test_reshaping_to_the_same_measures_changes_nothing(effects):
     system = system_of(effects)
@@ -60,6 +61,7 @@ def test_reshaping_gives_the_tables_of_a_new_scene(other):
     np.testing.assert_allclose(springs.compliance, anew.compliance, rtol=1e-3)
 
 
+@pytest.mark.release
 def test_lengths_follow_measures_with_their_gradient():
     """The sum of rest lengths by the trousers' ease, against a difference."""
     rest = load_body().rest_vertices(load_body().default_shape())

@@ -48,7 +48,7 @@ def test_garments_hold_on_by_their_bands_or_their_highest_border():
     assert np.asarray(template("bottom").pinned)[waist].all()
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_a_skirt_that_falls_is_flagged_and_one_with_a_band_is_not():
     motion = short("walk", 40)
     skirt = tailor("skirt", ease=0.2)

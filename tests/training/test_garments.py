@@ -86,6 +86,7 @@ def test_tables_sample_as_bindings_do():
         prepare_garments(dataclasses.replace(MODEL, templates=("bottom",)), wardrobe)
 
 
+@pytest.mark.release
 def test_means_are_those_of_patches():
     wardrobe = make_wardrobe([TIGHT, LOOSE], ("top",))
     *_, tables = prepare_garments(MODEL, wardrobe)
@@ -141,6 +142,7 @@ def test_share_of_patches_weighs_both_parts():
             TrainConfig(**given)
 
 
+@pytest.mark.release
 def test_elastic_energy_is_that_of_each_garment_on_its_person(body):
     wardrobe = make_wardrobe([TIGHT, LOOSE], ("top",))
     *_, tables = prepare_garments(MODEL, wardrobe, elastic=True)
@@ -248,7 +250,7 @@ def test_what_depends_on_the_garment_is_learned(learned, body):
     assert fallen[LOOSE] == pytest.approx(-OFF, abs=0.3 * OFF)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_garments_of_one_template_have_maps_of_their_own(learned, body, tmp_path):
     save_predictor(tmp_path / "w", learned, name="w")
     weights = load_predictor(tmp_path / "w")

@@ -139,6 +139,7 @@ def test_nan_data_stops_training_after_too_many_skipped_steps(tmp_path):
         train(config, [dataclasses.replace(bad, motion=spoiled)], tmp_path, steps=40)
 
 
+@pytest.mark.release
 def test_detached_cloth_is_excluded_from_training(tmp_path):
     with pytest.raises(FormatError, match="no usable sequence"):
         train(CONFIG, [sequence(ok=False)], tmp_path, steps=2)

@@ -38,6 +38,7 @@ def test_ease_is_seen_as_distance_and_area(seen):
     assert (loose["cloth over skin"][both] - tight["cloth over skin"][both]).mean() > 0.04
 
 
+@pytest.mark.release
 def test_flare_is_seen_on_the_chart_of_skirts(seen):
     narrow, wide = (seen(tailor(kind)) for kind in ("pencil-skirt", "full-skirt"))
     low = np.zeros((96, 64), bool)

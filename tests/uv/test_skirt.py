@@ -108,6 +108,7 @@ def test_sampling_goes_round_and_avoids_what_is_not_covered(atlas, hull):
     assert (weight == 0.0).all(), "nothing is sampled where nothing is known"
 
 
+@pytest.mark.release
 def test_maps_of_a_dress_give_it_back(body, atlas, aline):
     rest = body.rest_vertices(body.default_shape())
     rows = garment_map_rows(atlas, body, rest, aline)
@@ -128,6 +129,7 @@ def test_maps_of_a_dress_give_it_back(body, atlas, aline):
     assert np.abs(np.asarray(got) - wanted)[low].max() > 1.5e-2
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("kind", ["shirt", "trousers"])
 def test_other_garments_do_not_touch_it(body, atlas, kind):
     garment = tailor(kind)

@@ -36,6 +36,7 @@ def turned(meshes, angle):
     return [dataclasses.replace(m, positions=m.positions @ turn.T) for m in meshes]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("camera", ["three-quarter", "front", "follow", "turntable"])
 @pytest.mark.parametrize("size", [(160, 192), (256, 144)])
 def test_the_person_fills_the_picture(person, camera, size):
@@ -89,6 +90,7 @@ def test_feet_have_a_shadow_and_backgrounds_their_colour(person):
         render_frame(person, 0, background="#12")
 
 
+@pytest.mark.release
 def test_colours_stay_with_their_garment():
     def colours(wear):
         return {m.name: m.colour for m in dress("walk", wear, method="lbs", frames=1).garments}

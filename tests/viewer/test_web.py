@@ -20,15 +20,16 @@ from physxnet_jax.cli._view import view
 from physxnet_jax.dressing import Inference, Simulation
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.garment import template
-from physxnet_jax.io import read_obj, write_obj
+from physxnet_jax.io import GltfFile, read_obj, write_obj
 from physxnet_jax.motion import procedural_clip, save_motion
 
 pytest.importorskip("viser")
 
 from physxnet_jax.viewer import Choice, Viewer, record, run_job
-from physxnet_jax.viewer._controls import METHOD_LABELS
+from physxnet_jax.viewer._controls import METHOD_LABELS, _kinds
 
 _BROWSER = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "browser.py"))
+_SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
 SHORT = Choice("walk", ("bottom",), method="lbs", frames=10, fps=10.0)
 
 
@@ -89,6 +90,62 @@ def test_errors_are_reported_and_recovered_from(viewer, tmp_path):
     assert viewer.wait().choice == SHORT
     with pytest.raises(FormatError, match="neither a motion"):
         viewer.add_file("a.exe", b"MZ")
+
+
+@pytest.mark.release
+def test_uploaded_fabric_is_worn(viewer, tmp_path):
+    viewer.controls.settings["method"].value = METHOD_LABELS["simulate"]
+    viewer.controls.settings["frames"].value = 2
+    light = viewer.wait().garments[0].positions
+    viewer.add_file("lead.toml", b'base = "wool"\ndensity = 5.0\nstretch = 200.0\n')
+    menu = viewer.controls.settings["fabric"]
+    assert menu.value == "lead.toml"
+    shown = viewer.wait()
+    assert pathlib.Path(shown.choice.fabric).name == "lead.toml"
+    assert np.abs(shown.garments[0].positions - light).max() > 1e-3
+    with pytest.raises(FormatError, match=r"tin\.toml: a fabric has no 'weight'"):
+        viewer.add_file("tin.toml", b"weight = 1.0\n")
+    assert "tin.toml" not in menu.options
+    menu.value = menu.options[0]
+    viewer.controls.settings["method"].value = METHOD_LABELS["lbs"]
+    viewer.controls.settings["frames"].value = SHORT.frames
+    assert viewer.wait().choice == SHORT
+
+
+def test_kinds_of_uploads_are_told_apart(tmp_path, body):
+    _SAMPLES["rigged_person"](tmp_path / "hero.vrm", body)
+    (tmp_path / "hero.vrm").rename(tmp_path / "person.glb")
+    assert _kinds(tmp_path / "person.glb") == ("person",)
+    top = template("top").mesh
+    write_obj(tmp_path / "coat.obj", np.asarray(top.vertices), np.asarray(top.faces))
+    content = trimesh.load_mesh(tmp_path / "coat.obj").export(file_type="glb")
+    (tmp_path / "coat.glb").write_bytes(content)
+    assert _kinds(tmp_path / "coat.glb") == ("garment",)
+    assert _kinds(tmp_path / "coat.obj") == ("garment",)
+    (tmp_path / "coat.glb").rename(tmp_path / "coat.vrm")
+    with pytest.raises(FormatError, match="no person with a known skeleton"):
+        _kinds(tmp_path / "coat.vrm")
+
+
+@pytest.mark.release
+def test_uploaded_character_is_dressed_and_exported_with_its_skin(viewer, tmp_path, body):
+    _SAMPLES["rigged_person"](tmp_path / "hero.vrm", body, body.shape(weight_up=0.6))
+    viewer.add_file("hero.vrm", (tmp_path / "hero.vrm").read_bytes())
+    assert viewer.controls.settings["person"].value == "hero.vrm"
+    shown = viewer.wait()
+    assert shown.character is not None and [m.name for m in shown.garments] == ["bottom"]
+    assert shown.meshes()[0] is shown.character.mesh and shown.maps(0) == {}
+    assert shown.num_frames == len(shown.garments[0].positions) == SHORT.frames
+    name, content = viewer.export(".glb")
+    (tmp_path / name).write_bytes(content)
+    assert GltfFile(tmp_path / name).document.skins
+    # Another method goes on with the same fit.
+    viewer.controls.settings["compare"].value = True
+    again = viewer.wait()
+    assert again.character is shown.character and set(again.distances) == {"bottom"}
+    viewer.controls.settings["compare"].value = False
+    viewer.controls.settings["person"].value = viewer.controls.settings["person"].options[0]
+    assert viewer.wait().character is None
 
 
 def test_garments_keep_the_order_in_which_they_were_named(tmp_path, monkeypatch):
@@ -186,6 +243,7 @@ def test_page_skinning_matches_the_body(viewer, body):
     assert np.linalg.norm(seen - vertices, axis=1).max() < 0.01
 
 
+@pytest.mark.release
 def test_comparison_reports_distances_to_the_simulation():
     shown = run_job(Choice("balance", ("bottom",), method="lbs", frames=3, compare=True))
     d = shown.distances["bottom"]
@@ -320,8 +378,10 @@ def test_view_command_supports_all_page_options(tmp_path, monkeypatch):
     assert main(["view", "--html", "/proc/a.html"]) == 2
     assert main(["view", "--shape", "weight_up"]) == 2
     assert main(["view", "--shape", "girth=1", "--html", str(tmp_path / "a.html")]) == 2
-    with pytest.raises(SystemExit):
-        main(["view", "--fabric", "tin", "--html", str(tmp_path / "a.html")])
+    assert main(["view", "--fabric", "tin", "--html", str(tmp_path / "a.html")]) == 2
+    hero = str(tmp_path / "hero.vrm")
+    assert main(["view", "--character", hero, "--shape", "gender=1"]) == 2
+    assert main(["view", "--character", hero, "--html", str(tmp_path / "a.html")]) == 2
 
 
 @pytest.fixture

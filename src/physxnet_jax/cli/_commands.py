@@ -273,6 +273,8 @@ class View:
     """Compute each frame when it is shown, and report the time."""
     shape: tuple[str, ...] = ()
     """Shape parameters, as name=value: gender=1 weight_up=0.5 …"""
+    character: pathlib.Path | None = None
+    """A rigged character (.glb, .gltf, .vrm) that moves in place of the built-in body."""
     source: MotionSource = dataclasses.field(default_factory=lambda: MotionSource(frames=150))
     outfit: Outfit = dataclasses.field(default_factory=Outfit)
     inference: InferenceOptions = dataclasses.field(default_factory=InferenceOptions)

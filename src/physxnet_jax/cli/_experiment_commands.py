@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ._options import Fabric, QuietTerminal, RayAddress, Terminal
+from ._options import QuietTerminal, RayAddress, Terminal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,8 +175,8 @@ class Adapt:
     """A garment file, a tailored garment or a template, with options after a colon."""
     out: Annotated[pathlib.Path, tyro.conf.arg(aliases=["-o"])]
     """Folder for the weights."""
-    fabric: Fabric | None = None
-    """Fabric, if the garment names none."""
+    fabric: str | None = None
+    """Fabric, or a file of one, if the garment names none."""
     weights: str = "base"
     """Name or folder of the weights to start from."""
     simulate: bool = False

@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ..dressing import Inference, Simulation
 
 Accuracy = Literal["draft", "standard", "fine", "reference"]
-Fabric = Literal["cotton", "denim", "silk", "wool", "jersey", "leather"]
 
 
 RayAddress = tuple[str, ...] | None
@@ -121,8 +120,9 @@ class Outfit:
     templates (top, bottom, dress) and files (.obj, .glb, .gltf, .usd*, .ply, .stl), with options
     after a colon: tee:ease=0.12,length=0.5 or coat.obj:as=top,fabric=wool. Tops go over dresses
     and skirts, these over trousers; among garments of one type, later ones are outer."""
-    fabric: Fabric | None = None
-    """Fabric of all garments that don't name one."""
+    fabric: str | None = None
+    """Fabric of all garments that don't name one: cotton, denim, silk, wool, jersey or leather, or
+    a file of numbers (fabric.toml)."""
     made_on: pathlib.Path | None = None
     """Mesh of the body that the garment files were made on, in the same place as they."""
 

@@ -30,6 +30,11 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         )
     if command.compare and command.method == "simulate":
         raise PhysXNetError("--compare is for a --method other than simulate; leave it out.")
+    if command.character is not None and (command.shape or command.live):
+        raise PhysXNetError(
+            "--character has its own shape, and is dressed as a whole: leave out --shape"
+            " and --live."
+        )
     if command.html is not None:
         check_writable(command.html)
         if not command.compare:
@@ -50,6 +55,7 @@ def view(command: View, console: Console, *, over: threading.Event | None = None
         shape=tuple(parse_shape(command.shape).items()),
         simulation=command.simulation.build(),
         fabric=command.outfit.fabric,
+        character=command.character,
         frames=Choice().frames if source.frames is None else source.frames,
         fps=source.fps,
         start=source.start,

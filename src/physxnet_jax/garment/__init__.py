@@ -2,6 +2,7 @@
 
 from ._align import align_to_template as align_to_template
 from ._decimate import decimate as decimate
+from ._fabric import fabric_of as fabric_of, find_fabric as find_fabric
 from ._fit import clearance as clearance, lift_out as lift_out
 from ._garment import (
     FABRICS as FABRICS,
@@ -57,7 +58,6 @@ from ._templates import (
 )
 from ._wear import (
     WearItem as WearItem,
-    fabric_of as fabric_of,
     parse_wear as parse_wear,
     with_default_fabric as with_default_fabric,
     with_fabric as with_fabric,

@@ -3,11 +3,11 @@
 import dataclasses
 import pathlib
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from ..errors import PhysXNetError
-from ._garment import FABRICS, TEMPLATES, Fabric, Garment, Template
+from ._fabric import find_fabric
+from ._garment import TEMPLATES, Fabric, Garment, Template
 from ._search import AXES, UNITS
 from .tailoring import KINDS, MEASURES
 
@@ -26,7 +26,7 @@ class WearItem:
         up: The axis of a file that points up, one of ``x``, ``y``, ``z`` or their negatives.
         front: The axis of a file that the garment faces, likewise.
         made_on: File of the body that the garment was made on, in the same place.
-        fabric: Name of a fabric that replaces its own; None keeps it.
+        fabric: Name or file of a fabric that replaces its own (`find_fabric`); None keeps it.
         measures: Measures of a tailored garment [m].
         hold: Curves of a tailored garment that are fixed to the body.
     """
@@ -77,7 +77,6 @@ def parse_wear(word: str | pathlib.Path) -> WearItem:
     options = {key: value for key, _, value in pairs}
     known = {
         "as": TEMPLATES,
-        "fabric": tuple(FABRICS),
         "unit": tuple(UNITS),
         "up": AXES,
         "front": AXES,
@@ -92,6 +91,8 @@ def parse_wear(word: str | pathlib.Path) -> WearItem:
             raise PhysXNetError(f"{word}: {key} is one of {', '.join(known[key])}.")
         if key in MEASURES:
             measures[key] = _number(word, key, value)
+        if key == "fabric":
+            find_fabric(value)
     if "up" in options and options.get("front", "")[-1:] == options["up"][-1]:
         raise PhysXNetError(f"{word}: up and front are the same axis.")
     template: Template | None = options.get("as")  # pyright: ignore[reportAssignmentType]
@@ -118,7 +119,7 @@ def with_default_fabric(words: Sequence[str], fabric: str | None) -> tuple[str, 
     """Adds a fabric to the words of `parse_wear` that have none.
 
     Raises:
-        PhysXNetError: The fabric is unknown.
+        PhysXNetError: The fabric is unknown, or its file isn't one.
 
     Example:
         >>> with_default_fabric(["top", "coat.obj:as=top", "bottom:fabric=wool"], "silk")
@@ -126,8 +127,7 @@ def with_default_fabric(words: Sequence[str], fabric: str | None) -> tuple[str, 
     """
     if fabric is None:
         return tuple(words)
-    if fabric not in FABRICS:
-        raise PhysXNetError(f"No fabric '{fabric}'; there are {', '.join(FABRICS)}.")
+    find_fabric(fabric)
     out = []
     for word in words:
         item = parse_wear(word)
@@ -154,42 +154,12 @@ def with_made_on(words: Sequence[str], made_on: str | pathlib.Path | None) -> tu
     return tuple(out)
 
 
-def fabric_of(settings: str | Mapping[str, Any]) -> Fabric:
-    """A fabric by its name, or by numbers.
-
-    Args:
-        settings: A name in `FABRICS`, or attributes of `Fabric`; ``base`` names the fabric
-            of which the others are taken, cotton by default.
-
-    Raises:
-        ValueError: An unknown fabric or attribute, or a value that it can't have.
-
-    Example:
-        >>> fabric_of({"base": "jersey", "density": 0.2}).stretch
-        400.0
-    """
-    if isinstance(settings, str):
-        settings = {"base": settings}
-    numbers = dict(settings)
-    base = numbers.pop("base", "cotton")
-    if base not in FABRICS:
-        raise ValueError(f"no fabric '{base}'; there are {', '.join(FABRICS)}")
-    known = [f.name for f in dataclasses.fields(Fabric)]
-    unknown = sorted(set(numbers) - set(known))
-    if unknown:
-        raise ValueError(f"a fabric has no '{unknown[0]}'; it has base, {', '.join(known)}")
-    for name, value in numbers.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise ValueError(f"fabric: {name} is {value!r}, expected a number")
-    return dataclasses.replace(FABRICS[base], **{k: float(v) for k, v in numbers.items()})
-
-
 def with_fabric(garment: Garment, fabric: str | Fabric) -> Garment:
-    """Replaces the fabric of a garment, by name or by its parameters.
+    """Replaces the fabric of a garment, by name, file (`find_fabric`) or parameters.
 
     The thickness doesn't fall below the garment's own, because its gap to the skin depends on
     the coarseness of its mesh and on what it lies over, not on the fabric alone.
     """
-    cloth = FABRICS[fabric] if isinstance(fabric, str) else fabric
+    cloth = find_fabric(fabric) if isinstance(fabric, str) else fabric
     thickness = max(cloth.thickness, garment.fabric.thickness)
     return dataclasses.replace(garment, fabric=dataclasses.replace(cloth, thickness=thickness))

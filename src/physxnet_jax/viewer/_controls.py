@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..body import load_body
-from ..dressing import METHODS, Inference
+from ..dressing import METHODS, Inference, is_character
 from ..errors import FormatError, PhysXNetError
-from ..garment import FABRICS, TEMPLATES
+from ..garment import FABRICS, TEMPLATES, find_fabric
 from ..io import EXTENSIONS, GARMENT_FORMATS, GltfFile
 from ..models import list_weights
 from ..motion import CLIPS
@@ -28,7 +28,8 @@ METHOD_LABELS = {
 """Names of the methods on the page."""
 
 _MOTIONS = (".bvh", ".amc", ".npz", ".pkl", ".glb", ".gltf", ".vrma")
-_AS_CUT = "as cut"
+_FIGURES = (".vrm", ".glb", ".gltf")
+_AS_CUT, _BUILT_IN = "as cut", "the built-in body"
 # All uploads of a session [bytes].
 _MOST_KEPT = 5 * MOST_UPLOADED
 
@@ -107,6 +108,7 @@ class Controls:
         skeleton = first.skeleton if known else None
         if skeleton is None and motion.endswith(".amc") and w["motion"].value in self._uploads:
             skeleton = self._skeleton
+        fabric = w["fabric"].value
         height = first.simulation.wind[1] if first.simulation.wind else 0.0
         wind = (float(w["wind_x"].value), height, float(w["wind_z"].value))
         method = next(m for m, label in METHOD_LABELS.items() if label == w["method"].value)
@@ -127,7 +129,8 @@ class Controls:
             compare=w["compare"].value,
             live=w["live"].value,
             shape=shape,
-            fabric=None if w["fabric"].value == _AS_CUT else w["fabric"].value,
+            fabric=None if fabric == _AS_CUT else str(self.files.get(fabric, fabric)),
+            character=self.files.get(w["person"].value),
             simulation=dataclasses.replace(
                 first.simulation,
                 accuracy=w["accuracy"].value,
@@ -138,7 +141,7 @@ class Controls:
         )
 
     def add_file(self, name: str, content: bytes) -> None:
-        """Adds an uploaded motion or garment, and chooses it.
+        """Adds an uploaded motion, garment, character or fabric, and chooses it.
 
         Raises:
             FormatError: The file is of another kind.
@@ -147,10 +150,12 @@ class Controls:
         # Only the last part, in plain characters: an uploaded name must not act as a path.
         name = re.sub(r"[^\w.-]", "_", pathlib.PurePosixPath(name.replace("\\", "/")).name)[-80:]
         suffix = pathlib.Path(name).suffix.lower()
-        if suffix not in (*_MOTIONS, *GARMENT_FORMATS, ".asf") or name.startswith("."):
+        known = (*_MOTIONS, *GARMENT_FORMATS, *_FIGURES, ".asf", ".toml")
+        if suffix not in known or name.startswith("."):
             raise FormatError(
-                f"{name}: neither a motion ({', '.join(_MOTIONS)}) nor a garment"
-                f" ({', '.join(GARMENT_FORMATS)})."
+                f"{name}: neither a motion ({', '.join(_MOTIONS)}), a garment"
+                f" ({', '.join(GARMENT_FORMATS)}), a character ({', '.join(_FIGURES)}) nor a"
+                " fabric (.toml)."
             )
         kept = sum(self._uploads.values()) + len(content)
         if len(content) > MOST_UPLOADED or kept > _MOST_KEPT:
@@ -172,18 +177,16 @@ class Controls:
             # The AMC file that needs it may already be there.
             self._skeleton = path
             return
-        # A glTF file without animations is a garment.
-        moves = suffix in _MOTIONS
-        if moves and suffix in GARMENT_FORMATS:
-            moves = bool(GltfFile(path).document.animations)
+        kinds = _kinds(path)
         self.files[label] = path
-        if not moves:
+        if "garment" in kinds:
             with self._garments:
                 self._add_garment(label, True)
-        else:
-            menu = self.settings["motion"]
-            menu.options = (*menu.options, label)
-            menu.value = label
+        for name in ("motion", "person", "fabric"):
+            if name in kinds:
+                menu = self.settings[name]
+                menu.options = (*menu.options, label)
+                menu.value = label
 
     def _wear(self) -> tuple[str, ...]:
         """The ticked garments in command-line order: of one type, later ones are outer."""
@@ -200,7 +203,7 @@ class Controls:
             clips = (*clips, first)
         w["motion"] = gui.add_dropdown("motion", clips, initial_value=first)
         w["frames"] = gui.add_slider("frames", 1, max(600, choice.frames), 1, choice.frames)
-        self.upload = gui.add_upload_button("add a motion or garment file")
+        self.upload = gui.add_upload_button("add a motion, garment, character or fabric")
         self._garments = gui.add_folder("Garments")
         with self._garments:
             for name in dict.fromkeys((*TEMPLATES, *choice.wear)):
@@ -214,9 +217,13 @@ class Controls:
         wind = choice.simulation.wind or (0.0, 0.0, 0.0)
         strongest = max(10.0, *map(abs, wind))
         wind_range = (-strongest, strongest, 0.5)
-        w["fabric"] = gui.add_dropdown(
-            "fabric", (_AS_CUT, *FABRICS), initial_value=choice.fabric or _AS_CUT
-        )
+        fabrics, fabric = (_AS_CUT, *FABRICS), choice.fabric or _AS_CUT
+        if fabric not in fabrics:
+            path = pathlib.Path(fabric)
+            fabric = fabric if path.name in self.files else path.name
+            self.files[fabric] = path
+            fabrics = (*fabrics, fabric)
+        w["fabric"] = gui.add_dropdown("fabric", fabrics, initial_value=fabric)
         w["wind_x"] = gui.add_slider("wind from the right, m/s", *wind_range, wind[0])
         w["wind_z"] = gui.add_slider("wind from behind, m/s", *wind_range, wind[2])
 
@@ -245,6 +252,13 @@ class Controls:
             w["self_contact"] = gui.add_checkbox("cloth touches itself", simulation.self_contact)
 
     def _add_body(self, choice: Choice) -> None:
+        people, person = (_BUILT_IN,), _BUILT_IN
+        if choice.character is not None:
+            path = choice.character
+            person = str(path) if path.name in self.files else path.name
+            self.files[person] = path
+            people = (_BUILT_IN, person)
+        self.settings["person"] = self._gui.add_dropdown("person", people, initial_value=person)
         body, overrides = load_body(), dict(choice.shape)
         for name, x in zip(body.shape_names, np.asarray(body.default_shape()), strict=True):
             value = round(overrides.get(name, float(x)), 2)
@@ -256,3 +270,24 @@ class Controls:
         box = self._gui.add_checkbox(name, worn)
         box.on_update(lambda _: self._changed())
         self.worn[name] = box
+
+
+def _kinds(path: pathlib.Path) -> tuple[str, ...]:
+    """What an uploaded file is: garment, motion, person, fabric, or a person with a motion.
+
+    Raises:
+        PhysXNetError: The file isn't what its name says.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".toml":
+        find_fabric(path)
+        return ("fabric",)
+    if suffix not in _FIGURES:
+        return ("motion",) if suffix in _MOTIONS else ("garment",)
+    moves = ("motion",) if GltfFile(path).document.animations else ()
+    if is_character(path):
+        return ("person", *moves)
+    if suffix == ".vrm":
+        raise FormatError(f"{path.name}: no person with a known skeleton.")
+    # A glTF file without animations is a garment.
+    return moves or ("garment",)

@@ -15,18 +15,20 @@ from .._environment import clear_caches_if_full
 from ..body import load_body
 from ..dressing import (
     INFERENCE_STAGES,
+    Character,
     Dresser,
     Inference,
     Simulation,
     animated_meshes,
     dress,
+    load_character,
     make_dresser,
     make_scene,
     run_simulation,
 )
 from ..errors import PhysXNetError
 from ..evaluation import load_cost_table, method_name, parse_method
-from ..garment import FABRICS, with_default_fabric
+from ..garment import find_fabric, with_default_fabric
 from ..io import AnimatedMesh
 from ..models import read_card
 from ..motion import BLOCK, Motion, clip_transforms, prepare_motion, stand_on_floor
@@ -50,7 +52,8 @@ class Choice:
         shape: Shape parameters by name; none for the default shape.
         simulation: Options of the simulator. The reference is always ``standard``, on which
             the networks were trained.
-        fabric: Fabric of garments that specify none.
+        fabric: Fabric of garments that specify none, or its file.
+        character: A rigged character that moves in place of the built-in body.
         start: Start time in the motion [s].
         frames: Maximum number of frames.
         fps: Frames per second.
@@ -69,6 +72,7 @@ class Choice:
     shape: tuple[tuple[str, float], ...] = ()
     simulation: Simulation = dataclasses.field(default_factory=Simulation)
     fabric: str | None = None
+    character: pathlib.Path | None = None
     start: float = 0.0
     frames: int = 150
     fps: float = 30.0
@@ -93,6 +97,7 @@ class Shown:
         summary: The computation, its speed and its accuracy, as Markdown.
         clip: The motion.
         live: Computes the garments frame by frame; None if it wasn't requested.
+        character: The character that wears them; None for the built-in body.
     """
 
     choice: Choice
@@ -105,6 +110,7 @@ class Shown:
     summary: str
     clip: Motion
     live: Live | None = None
+    character: Character | None = None
 
     @property
     def num_frames(self) -> int:
@@ -112,14 +118,18 @@ class Shown:
         return len(self.world)
 
     def meshes(self) -> tuple[AnimatedMesh, ...]:
-        """The body and the garments, for export."""
+        """The person and the garments, for export."""
+        if self.character is not None:
+            return (self.character.mesh, *self.garments)
         positions = {m.name: m.positions for m in self.garments}
         body = animated_meshes(load_body(), self.clip, _shape(self.choice), (), positions)
         return (*body, *self.garments)
 
     def maps(self, frame: int) -> dict[str, np.ndarray]:
-        """The network's maps of a frame for what is worn, as pictures."""
+        """The network's maps of a frame for what is worn, as pictures; none for a character."""
         choice = self.choice
+        if self.character is not None:
+            return {}
         weights = str(choice.inference.weights)
         worn = with_default_fabric(choice.wear, choice.fabric) or ("bottom",)
         dresser = _network(worn, weights, choice.shape, str(read_card(weights)["sha256"]))
@@ -138,8 +148,8 @@ def check_choice(choice: Choice) -> None:
     """
     if choice.frames < 1:
         raise PhysXNetError(f"frames is {choice.frames}; it must be at least one.")
-    if choice.fabric is not None and choice.fabric not in FABRICS:
-        raise PhysXNetError(f"No fabric '{choice.fabric}'; there are {', '.join(FABRICS)}.")
+    if choice.fabric is not None:
+        find_fabric(choice.fabric)
     _shape(choice)
     if choice.method in ("network", "guided"):
         read_card(str(choice.inference.weights))
@@ -158,8 +168,7 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     check_choice(choice)
     # A page may stay open for days.
     clear_caches_if_full()
-    body = load_body()
-    shape = _shape(choice)
+    body, shape, character = load_body(), _shape(choice), None
     clip = prepare_motion(
         choice.motion,
         fps=choice.fps,
@@ -172,32 +181,38 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
         body=body,
         shape=shape,
     )
+    person: Motion | Character = clip
+    if choice.character is not None:
+        person = character = _moved(choice.character, clip, progress)
+        body, clip, shape = character.body, character.motion, None
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     if shape is not None:
         # As in `dress`, after slicing: the lowest foot of the clip is on the floor.
-        clip = stand_on_floor(body, clip, rest)
+        person = clip = stand_on_floor(body, clip, rest)
     garments: tuple[AnimatedMesh, ...] = ()
     reference: tuple[AnimatedMesh, ...] = ()
     lines = [f"{clip.num_frames} frames at {clip.fps:g} fps"]
     if choice.wear and choice.method == "simulate":
-        garments, ms = _simulated(choice, clip, progress)
+        garments, ms = _simulated(choice, person, progress)
         engine = choice.simulation.engine
         how = choice.simulation.accuracy if engine == "xpbd" else engine
         lines.append(f"simulated ({how}): {ms:.0f} ms a frame, compilation included")
     elif choice.wear:
-        garments, found = _dressed(choice, clip, shape, progress)
+        garments, found = _dressed(choice, person, shape, progress)
         lines += found
     distances: dict[str, np.ndarray] = {}
     if choice.compare and choice.wear and choice.method != "simulate":
-        reference, distances = _compared(choice, clip, garments, progress)
+        reference, distances = _compared(choice, person, garments, progress)
         for name, distance in distances.items():
             rmse = 1e3 * float(np.sqrt((distance**2).mean()))
             # Escaped, because the name may come from a file and the page renders HTML.
             lines.append(f"{html.escape(name)}: {rmse:.1f} mm RMSE from the simulation")
     world, shift = clip_transforms(body, rest, clip)
+    if character is not None and choice.live:
+        lines.append("frames are computed while playing on the built-in body alone")
     summary = "\n".join(f"* {line}" for line in lines if line)
     live = None
-    if choice.live and choice.wear and choice.method in ("network", "guided"):
+    if character is None and choice.live and choice.wear and choice.method in ("network", "guided"):
         live = Live(
             clip,
             with_default_fabric(choice.wear, choice.fabric),
@@ -217,15 +232,29 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
         summary,
         clip,
         live,
+        character,
     )
 
 
+def _moved(path: pathlib.Path, clip: Motion, progress: Progress | None) -> Character:
+    """The character in a motion; fitting the body to it takes longer than most changes."""
+    key = path, path.stat().st_mtime_ns, clip.name, clip.fps, np.asarray(clip.root).tobytes()
+    if _FITTED.get("key") != key:
+        _FITTED["character"] = load_character(path, fps=clip.fps, motion=clip, progress=progress)
+        _FITTED["key"] = key
+    return _FITTED["character"]
+
+
+# The last character, and what it was made from.
+_FITTED: dict[str, Any] = {}
+
+
 def _dressed(
-    choice: Choice, clip: Motion, shape: Any | None, progress: Progress | None
+    choice: Choice, person: Motion | Character, shape: Any | None, progress: Progress | None
 ) -> tuple[tuple[AnimatedMesh, ...], list[str]]:
     """Garments by network or skinning, and lines that describe the result."""
     dressed = dress(
-        clip,
+        person,
         with_default_fabric(choice.wear, choice.fabric),
         method=choice.method,  # pyright: ignore[reportArgumentType]
         inference=choice.inference,
@@ -255,12 +284,12 @@ def _effects(choice: Choice) -> Simulation:
 
 def _compared(
     choice: Choice,
-    clip: Motion,
+    person: Motion | Character,
     garments: tuple[AnimatedMesh, ...],
     progress: Progress | None,
 ) -> tuple[tuple[AnimatedMesh, ...], dict[str, np.ndarray]]:
     """The simulation beside the garments, and the distances to it [m]."""
-    reference, _ = _simulated(choice, clip, progress)
+    reference, _ = _simulated(choice, person, progress)
     by_name = {m.name: m.positions for m in reference}
     return reference, {
         m.name: np.linalg.norm(m.positions - by_name[m.name], axis=2) for m in garments
@@ -268,9 +297,21 @@ def _compared(
 
 
 def _simulated(
-    choice: Choice, clip: Motion, progress: Progress | None
+    choice: Choice, person: Motion | Character, progress: Progress | None
 ) -> tuple[tuple[AnimatedMesh, ...], float]:
     wear = with_default_fabric(choice.wear, choice.fabric)
+    began = time.perf_counter()
+    if isinstance(person, Character):
+        dressed = dress(
+            person,
+            wear,
+            method="simulate",
+            simulation=choice.simulation,
+            include_body=False,
+            progress=progress,
+        )
+        return dressed.garments, 1e3 * (time.perf_counter() - began) / dressed.num_frames
+    clip = person
     job = make_scene(clip, wear, simulation=choice.simulation, shape=_shape(choice))
     began = time.perf_counter()
     rollout = run_simulation(job.scene, clip, choice.simulation, progress=progress)

@@ -41,12 +41,19 @@ class Stage:
             cell_color=(232, 232, 232),
             section_color=(205, 205, 205),
         )
-        self._bodies = [self._body("body")]
-        self._meshes = [(m, np.zeros(3, np.float32), self._mesh(m, "")) for m in shown.garments]
+        worn = shown.garments
+        if shown.character is not None:
+            worn = (shown.character.mesh, *worn)
+        self._bodies = [] if shown.character is not None else [self._body("body")]
+        self._meshes = [(m, np.zeros(3, np.float32), self._mesh(m, "")) for m in worn]
         self._dots = {}
         if shown.reference:
-            self._bodies.append(self._body("reference/body"))
-            self._meshes += [(m, BESIDE, self._mesh(m, "reference/")) for m in shown.reference]
+            beside = shown.reference
+            if shown.character is None:
+                self._bodies.append(self._body("reference/body"))
+            else:
+                beside = (shown.character.mesh, *beside)
+            self._meshes += [(m, BESIDE, self._mesh(m, "reference/")) for m in beside]
         for m in shown.garments:
             if m.name in shown.distances:
                 self._dots[m.name] = scene.add_point_cloud(

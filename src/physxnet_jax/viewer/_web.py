@@ -14,6 +14,7 @@ import zipfile
 from collections.abc import Iterator
 from typing import Any
 
+from ..dressing import write_dressed_character
 from ..errors import FormatError, PhysXNetError
 from ..io import EXTENSIONS, write_clip
 from ._controls import Controls
@@ -116,7 +117,7 @@ class Viewer:
         raise PhysXNetError(f"Nothing to show after {seconds:g} seconds.")
 
     def add_file(self, name: str, content: bytes) -> None:
-        """Adds an uploaded motion or garment.
+        """Adds an uploaded motion, garment, character or fabric.
 
         Raises:
             FormatError: The file is of another kind.
@@ -141,7 +142,11 @@ class Viewer:
         with tempfile.TemporaryDirectory() as folder:
             name = re.sub(r"[^\w.-]", "_", pathlib.Path(shown.choice.motion).stem)
             out = pathlib.Path(folder) / f"{name}{suffix}"
-            written = write_clip(out, shown.meshes(), shown.clip.fps)
+            person = shown.character
+            if suffix == ".glb" and person is not None and person.rig is not None:
+                written = [write_dressed_character(out, person, shown.garments)]
+            else:
+                written = write_clip(out, shown.meshes(), shown.clip.fps)
             if len(written) == 1:
                 return written[0].name, written[0].read_bytes()
             archive = pathlib.Path(folder) / f"{name}.zip"

@@ -53,6 +53,7 @@ def every_kind():
     return [k if k in QUICK else pytest.param(k, marks=pytest.mark.release) for k in KINDS]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", every_kind())
 def test_every_kind_is_a_clean_mesh_around_the_body(body, name):
     kind, g = KINDS[name], tailor(name)
@@ -213,6 +214,7 @@ def test_garments_are_cut_to_the_person(body):
         assert length == pytest.approx(KINDS["shorts"].ranges["length"].default, abs=0.003)
 
 
+@pytest.mark.release
 def test_cutting_is_differentiable_by_shape(body):
     zeros = body.default_shape()
 

@@ -52,6 +52,7 @@ def test_polynomial_follows_the_implicit_step_and_stays_small(degree):
     assert np.abs(answer - 1.0 / (1.0 + size))[smooth].max() < 0.05
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("fabric", ["silk", "denim"])
 def test_sag_of_a_strip_hardly_depends_on_the_number_of_substeps(fabric):
     """Stiff cloth isn't softer with few substeps, or limp cloth stiffer."""

@@ -59,6 +59,7 @@ def test_self_contact_stops_a_falling_sheet_on_another():
     assert free.positions[0][-1, first:, 1].max() < -0.5
 
 
+@pytest.mark.release
 def test_grid_search_finds_the_nearest_vertex_on_each_side():
     """Against all pairs, for a crumpled cloud; a cell that is too small says so."""
     rng = np.random.default_rng(0)
@@ -84,6 +85,7 @@ def test_grid_search_finds_the_nearest_vertex_on_each_side():
     assert int(tiny.nearest(jnp.asarray(x))[1]) > 0
 
 
+@pytest.mark.release
 def test_self_contact_without_contacts_is_bitwise_neutral():
     g = square_sheet(6)
     plain = (Gravity(), Stretch(), Pin())
@@ -168,6 +170,7 @@ def test_seams_close_the_gap_between_panels():
         prepare_scene(Scene((left, right), (Seam(((0, 99),)),)))
 
 
+@pytest.mark.release
 def test_cloth_contact_does_not_depend_on_absolute_time():
     """The gap a pair keeps doesn't depend on where in time the block lies."""
     g, _ = two_sheets()
@@ -217,6 +220,7 @@ def test_self_contact_is_within_each_garment_only():
         assert bool((other & (np.asarray(near) >= 0)).any()) == meet
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("held", "share"), [(True, 1.0), (False, 0.5)])
 def test_layers_move_each_vertex_by_its_share(held, share):
     """Two like sheets, vertex over vertex, pressed together: to the gap, or half of the way each."""
@@ -281,6 +285,7 @@ def folded_sheet(n=9, size=0.16, angle=120.0):
     return v, np.asarray(g.mesh.faces)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("before", [True, False])
 def test_side_of_a_layer_is_right_beside_a_sharp_fold(before):
     """Points before a ridge are outside, whichever of its triangles is the closest."""
@@ -300,6 +305,7 @@ def test_side_of_a_layer_is_right_beside_a_sharp_fold(before):
     assert ((height > 0) == before).all()
 
 
+@pytest.mark.release
 def test_layers_of_folds_that_face_each_other_stay_apart():
     """An outer sheet turned over and laid behind the inner one isn't drawn through it."""
     inner = square_sheet(8, 0.2, upright=True)

@@ -189,6 +189,7 @@ def test_contact_corrections_are_bounded_by_the_push_setting(push):
     assert far == pytest.approx(push, rel=1e-3) if push < 0.01 else 0.005 < far < 0.03
 
 
+@pytest.mark.release
 def test_cloth_moving_with_the_skin_has_no_friction():
     """Trousers 2 mm too deep on skin that moves sideways by a centimetre, as they do."""
     g = template("bottom")
@@ -209,6 +210,7 @@ def test_cloth_moving_with_the_skin_has_no_friction():
         assert (float(jnp.abs(along).max()) > 1e-4) == rubs
 
 
+@pytest.mark.release
 def test_contact_does_not_affect_cloth_far_from_the_body():
     """No height counts as limited where nothing limits it: ten metres away, say."""
     mesh = square_sheet(4, 0.3).mesh

@@ -77,7 +77,7 @@ def test_a_weight_hangs_where_tension_carries_it():
     assert heights == pytest.approx(expected, rel=0.03)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_a_strapless_top_stays_up_by_its_band_alone():
     """Its negative control is the same top without the effect."""
     motion = load_motion("jump", fps=30.0)

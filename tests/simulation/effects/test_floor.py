@@ -109,6 +109,7 @@ def test_depth_below_the_floor_is_reported():
     assert still.diagnostics["below_floor_max"].max() == 0.0
 
 
+@pytest.mark.release
 def test_long_garments_and_low_persons_call_for_a_floor(body, rest):
     cloth = sheet()
     down = np.asarray(rest)[:NUM_BODY_VERTICES, 1].min() + 0.02

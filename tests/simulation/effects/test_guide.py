@@ -98,6 +98,7 @@ def test_without_a_target_nothing_changes():
     assert len(program(guided)) > len(program(plain))
 
 
+@pytest.mark.release
 def test_a_guided_sheet_falls_no_further_and_its_gradients_are_finite():
     others = (Gravity(), Stretch(), Bend())
     scene, guide = prepared((sheet(),), Guide(0.1, 0.01), *others)

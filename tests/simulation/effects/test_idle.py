@@ -151,6 +151,7 @@ def test_an_idle_parameter_is_left_out(name):
         np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", FRICTION)
 def test_contact_without_friction_computes_none(name):
     busy, idle, garments = FRICTION[name]

@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 from ...body import Body, load_body
 from ...errors import PhysXNetError
 from ...geometry import make_mesh
-from .._garment import FABRICS, Fabric, Garment, Template
+from .._fabric import find_fabric
+from .._garment import Fabric, Garment, Template
 from ._charts import load_charts, place_table
 from ._cut import class_of, cut, pattern_of, resolve_measures
 from ._flatten import flatten
@@ -101,9 +102,7 @@ def tailor(
 
 
 def _fabric(name: str) -> Fabric:
-    if name not in FABRICS:
-        raise PhysXNetError(f"No fabric '{name}'; there are {', '.join(FABRICS)}.")
-    cloth = FABRICS[name]
+    cloth = find_fabric(name)
     return dataclasses.replace(cloth, thickness=max(cloth.thickness, _LEAST_THICKNESS))
 
 
