@@ -1,10 +1,10 @@
 """What a network should minimise: the same decoder, data and steps under each loss.
 
 Command: python experiments/losses.py --data runs/clothes/default
-         --weights small (default), --steps 800 (default), --templates dress (default)
+         --weights runs/small/weights (default), --steps 800 (default), --templates dress (default)
 Cost:    about 40 minutes a template on two cores; goes on where it was stopped.
 Result:  experiments/results/losses.json and .md: each default garment's decoder goes on from the
-         shipped weights, on its simulations of the training actions. On the twelve test actions:
+         weights, on its simulations of the training actions. On the twelve test actions:
          RMSE, folds over the simulation's, wrinkle error, distance of spectra, 99 % of tension and
          jerk over the simulation's.
          vertices: L1 at vertices. patches: half of it at means over patches, the shipped recipe.
@@ -261,7 +261,7 @@ def table(rows: list[dict]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--data", required=True)
-    parser.add_argument("--weights", default="small")
+    parser.add_argument("--weights", default="runs/small/weights")
     parser.add_argument("--steps", type=int, default=800)
     parser.add_argument("--templates", nargs="+", choices=DEFAULT_KINDS, default=["dress"])
     parser.add_argument("--out", type=pathlib.Path, default=RESULTS / "losses.json")
@@ -280,7 +280,7 @@ def main() -> None:
     rest = body.rest_vertices(body.default_shape())
     for template in options.templates:
         known = {r["loss"] for r in rows if r["template"] == template}
-        if not {"as shipped", *KINDS} - known:
+        if not {"at the start", *KINDS} - known:
             continue
         found = sequences(options.data, "train", template)
         tests = sequences(options.data, "test", template)
@@ -290,8 +290,8 @@ def main() -> None:
         task, first = make_task(predictor, body, rest, worn, physics, AdaptConfig(), True)
         rows_of_map = garment_map_rows(predictor.atlas, body, rest, worn)
         elastic = (jax.tree.map(lambda x: x[0], elastic_tables([worn], [None])),)
-        if "as shipped" not in known:
-            add(template, "as shipped", 0.0, measure(predictor, scene.assembly, tests, template))
+        if "at the start" not in known:
+            add(template, "at the start", 0.0, measure(predictor, scene.assembly, tests, template))
         clips = data_of(task, first, found, template)
         for kind in (k for k in KINDS if k not in known):
             began = time.perf_counter()

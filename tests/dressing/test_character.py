@@ -319,3 +319,21 @@ def test_dress_command_retargets_a_motion_to_a_rig(body, tmp_path, capsys):
     names.write_text('Hips = "nowhere"\n')
     assert main([*words, "--character-map", str(names)]) == 2
     assert "no joint 'nowhere'" in capsys.readouterr().err
+
+
+@pytest.mark.release
+def test_ten_kilometres_away_a_character_wears_the_same(man):
+    _, _, mesh, bind = man
+    away = np.asarray([10_000.0, 0.0, -8_000.0], np.float32)
+    there = dataclasses.replace(mesh, positions=mesh.positions[:4] + away)
+    # The same rounded motion at the origin.
+    here = dataclasses.replace(mesh, positions=there.positions - away)
+    far, near = (make_character(m, FPS, bind=bind) for m in (there, here))
+    assert not near.place.any() and np.linalg.norm(far.place - away) < 2.0
+    spacing = np.spacing(np.float32(10_000.0))
+    for method in ("lbs", "network"):
+        a, b = (dress(p, ["bottom"], method=method) for p in (far, near))
+        np.testing.assert_array_equal(a.meshes[0].positions, there.positions)
+        gap = a.garments[0].positions.astype(np.float64) - away - b.garments[0].positions
+        assert np.abs(gap).max() < 0.6 * spacing, (method, np.abs(gap).max())
+        assert a.inside["bottom"] == pytest.approx(b.inside["bottom"], abs=0.01)

@@ -42,6 +42,8 @@ _MAX_RESIDUAL = 0.15
 _MAX_RISE = 0.015
 # Nearest triangles examined for each vertex; maximum distance that cloth slides [m].
 _NUM_CANDIDATES, _MAX_SLIDE = 40, 0.15
+# Farther than this from the origin, positions are too coarse to compute with [m].
+_FAR = 50.0
 # Frames sampled for the share of a garment inside the character.
 _NUM_SAMPLED = 40
 
@@ -65,6 +67,8 @@ class Character:
         missed: Share of vertices in clothed regions without a counterpart on the surface.
         notes: Remarks on the file.
         rig: The rig that a motion drives; None for other persons.
+        place: What was subtracted from the mesh's positions before anything was computed [m]: the
+            body, its motion and the surface are relative to it. Zero near the origin.
     """
 
     mesh: AnimatedMesh
@@ -78,6 +82,9 @@ class Character:
     missed: float
     notes: tuple[str, ...] = ()
     rig: RigClip | None = None
+    place: Float[np.ndarray, "3"] = dataclasses.field(
+        default_factory=lambda: np.zeros(3, np.float32)
+    )
 
     def after(self, start: float) -> "Character":
         """The character from a time on.
@@ -184,9 +191,11 @@ def make_character(
     """
     base = load_body()
     mesh = dataclasses.replace(mesh, name="body")
+    place = _far_place(mesh.positions[0])
+    positions = mesh.positions - place if place.any() else mesh.positions
     found = None
     error: MeshError | None = None
-    for pose in _poses(mesh.positions, bind):
+    for pose in _poses(positions, bind):
         try:
             found = register_body(pose, mesh.faces, progress=progress)
             break
@@ -195,7 +204,7 @@ def make_character(
     if found is None:
         assert error is not None
         raise error
-    surface = found.carried(mesh.positions, mesh.faces)
+    surface = found.carried(positions, mesh.faces)
     body = base.with_rest(jnp.asarray(found.rest))
     clothed = clothed_vertices(base)
     sure = found.sure & clothed
@@ -220,11 +229,19 @@ def make_character(
         motion,
         residual.astype(np.float32),
         surface,
-        _corners(body, mesh.positions, surface),
+        _corners(body, positions, surface),
         float(found.distance[sure].mean()),
         float(1.0 - sure[clothed].mean()),
         notes,
+        place=place,
     )
+
+
+def _far_place(positions: Float[np.ndarray, "vertices 3"]) -> Float[np.ndarray, "3"]:
+    """The point on the ground below a person who stands far from the origin [m], else zero."""
+    middle = positions.astype(np.float64).mean(axis=0) * [1.0, 0.0, 1.0]
+    far = np.isfinite(middle).all() and np.linalg.norm(middle) > _FAR
+    return np.asarray(np.round(middle) if far else np.zeros(3), np.float32)
 
 
 def _corners(

@@ -263,8 +263,9 @@ def _load_person(
         whole = prepare_motion(motion, fps=fps, body=body, shape=shape)
         part, past = slice_motion(whole, start, frames)
         rest = body.rest_vertices(body.checked_shape(shape))
-        place = np.zeros(3, np.float32) if character is not None else ground_point(part)
-        part, past = (m and m.moved(-place) for m in (part, past))
+        place = ground_point(part) if character is None else character.place
+        if character is None:
+            part, past = (m and m.moved(-place) for m in (part, past))
         clip = pose_clip(body, rest, part, past)
     return _Person(body=body, shape=shape, clip=clip, character=character, place=place)
 
@@ -423,9 +424,14 @@ def _assemble_clip(
         )
         for n, (_, shares) in cloth.inside.items():
             worst[n] = (int(shares.argmax()), float(shares.max()))
-        positions = {n: moved_frames(x, person.place) for n, x in cloth.positions.items()}
-        if rollout is not None:
-            rollout = dataclasses.replace(rollout, positions=tuple(positions.values()))
+        positions = cloth.positions
+    positions = {n: moved_frames(x, person.place) for n, x in positions.items()}
+    if rollout is not None:
+        # On a character the rollout is the simulation before collisions with its surface.
+        simulated = cloth.positions if character is not None else positions
+        place = person.place if character is not None else np.zeros(3, np.float32)
+        there = tuple(moved_frames(x, place) for x in simulated.values())
+        rollout = dataclasses.replace(rollout, positions=there)
     meshes = animated_meshes(
         person.body, clip.motion, person.shape, dresser.garments, positions, include_body
     )

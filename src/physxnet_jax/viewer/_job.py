@@ -184,7 +184,8 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     person: Motion | Character = clip
     if choice.character is not None:
         person = character = _moved(choice.character, clip, progress)
-        body, clip, shape = character.body, character.motion, None
+        body, shape = character.body, None
+        clip = character.motion.moved(character.place)
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     if shape is not None:
         # As in `dress`, after slicing: the lowest foot of the clip is on the floor.
