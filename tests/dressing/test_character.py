@@ -188,6 +188,31 @@ def test_cloth_is_moved_out_of_the_character_surface(character):
     assert np.linalg.norm(out - tight, axis=2).max() < 0.06
 
 
+@pytest.mark.release
+def test_guided_cloth_is_moved_out_of_the_character_surface(character):
+    """Narrow rings around the thighs, which the simulation of the skinned body doesn't see."""
+    body, clip = character.body, character.motion
+    rest = body.rest_vertices(body.default_shape())
+    skin = np.asarray(rest)[:13380]
+    ring = np.exp(-0.5 * ((skin[:, 1] - skin[:, 1].min() - 0.65) / 0.012) ** 2)
+    outward = np.asarray(vertex_normals(jnp.asarray(skin), body.rest_mesh().faces))
+    world, _ = clip_transforms(body, rest, clip)
+    weights = np.asarray(body.weights)[:13380]
+    grown = 0.05 * np.einsum("vj,fjab,vb->fva", weights, world, outward) * ring[:, None]
+    grown = grown.astype(np.float32)
+    ringed = dataclasses.replace(
+        character, residual=grown, surface=np.asarray(body_animation(body, clip)) + grown
+    )
+    found = {}
+    for collisions in (True, False):
+        found[collisions] = dress(
+            ringed, ["bottom"], inference=Inference(weights="nano", collisions=collisions), frames=3
+        )
+    assert found[True].method == "guided" and found[False].inside["bottom"] > 0.01
+    assert found[False].inside == found[False].inside_raw
+    assert found[True].inside["bottom"] < 0.5 * found[True].inside_raw["bottom"]
+
+
 def test_near_skin_follows_sliding_cloth_but_not_to_another_limb(character):
     body = character.body
     rest = body.rest_vertices(body.default_shape())

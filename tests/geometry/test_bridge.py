@@ -63,6 +63,15 @@ def test_cloth_without_a_new_hollow_stays_bit_for_bit():
     np.testing.assert_array_equal(bridge_hollows(wider, made, faces), wider)
 
 
+def test_what_may_not_move_stays():
+    made, faces = tube(plain)
+    carried, _ = tube(dent(0.04, 0.02))
+    free = np.arange(len(made)) % 2 == 0
+    taut = bridge_hollows(carried, made, faces, free)
+    np.testing.assert_array_equal(taut[~free], carried[~free])
+    assert (taut[free] != carried[free]).any()
+
+
 def test_borders_stay_and_what_protrudes_stays():
     made, faces = tube(plain)
     bulged, _ = tube(dent(-0.04, 0.02))

@@ -105,7 +105,12 @@ def test_uploaded_fabric_is_worn(viewer, tmp_path):
     assert np.abs(shown.garments[0].positions - light).max() > 1e-3
     with pytest.raises(FormatError, match=r"tin\.toml: a fabric has no 'weight'"):
         viewer.add_file("tin.toml", b"weight = 1.0\n")
+    for _ in range(2):
+        with pytest.raises(FormatError):
+            viewer.add_file("tin.toml", b"weight = 1.0\n")
     assert "tin.toml" not in menu.options
+    viewer.add_file("tin.toml", b"density = 1.0\n")
+    assert menu.value == "tin.toml"
     menu.value = menu.options[0]
     viewer.controls.settings["method"].value = METHOD_LABELS["lbs"]
     viewer.controls.settings["frames"].value = SHORT.frames

@@ -350,13 +350,15 @@ def _project_to_surface(
 def _drawn(
     x: np.ndarray, n: np.ndarray, target: Scan
 ) -> tuple[Float[np.ndarray, " vertices"], Float[np.ndarray, "vertices 3"]]:
-    """Vertices that are nearest to some of the surface, 1 or 0, and the mean way to it [m]."""
+    """Vertices that are nearest to some of the surface, 1 or 0, and the way out to it [m]."""
     row, distance = nearest_facing(KDTree(x), n, target.points, target.normals)
     near = distance < _REACH
     count = np.bincount(row[near], minlength=len(x))
     way = np.zeros(x.shape)
     np.add.at(way, row[near], target.points[near] - x[row[near]])
-    return (count > 0).astype(float), way / np.maximum(count, 1)[:, None]
+    # Along the normal alone: vertices keep their distances from each other.
+    way = n * np.einsum("vc,vc->v", n, way / np.maximum(count, 1)[:, None])[:, None]
+    return (count > 0).astype(float), way
 
 
 def clothed_vertices(body: Body) -> Bool[np.ndarray, " vertices"]:

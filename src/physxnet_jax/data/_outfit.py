@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from ..body import load_body
 from ..errors import PhysXNetError
-from ..garment import KINDS, Garment, Template, parse_wear, tailor, template
+from ..garment import FABRICS, KINDS, Garment, Template, parse_wear, tailor, template
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -31,6 +31,8 @@ class Outfit:
         for word in self.wear:
             if parse_wear(word).name not in KINDS:
                 raise ValueError(f"the tailor makes no '{word}'; there are {', '.join(KINDS)}.")
+            if parse_wear(word).fabric not in (None, *FABRICS):
+                raise ValueError(f"{word}: the fabric of an outfit is one of {', '.join(FABRICS)}.")
         for word in self.shape:
             _, _, value = word.partition("=")
             try:

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 
 from ..body import Body, clothed_vertices, load_body, register_body, skin_points
 from ..errors import FormatError, MeshError
+from ..frames import moved_frames
 from ..garment import Garment, SkinnedGarment
 from ..geometry import bridge_hollows, map_frames
 from ..io import AnimatedMesh, GltfFile, smooth_normals, write_dressed_rig
@@ -192,7 +193,9 @@ def make_character(
     base = load_body()
     mesh = dataclasses.replace(mesh, name="body")
     place = _far_place(mesh.positions[0])
-    positions = mesh.positions - place if place.any() else mesh.positions
+    positions = moved_frames(mesh.positions, -place)
+    if bind is not None:
+        bind = bind - _far_place(bind)
     found = None
     error: MeshError | None = None
     for pose in _poses(positions, bind):
@@ -327,8 +330,11 @@ def bind_to_character(garment: Garment, character: Character) -> Garment:
     """
     rest = character.body.rest_vertices(character.body.default_shape())
     carried, made = garment.rest_vertices(rest), np.asarray(garment.mesh.vertices)
-    taut = bridge_hollows(np.asarray(carried), made, np.asarray(garment.mesh.faces))
-    taut = jnp.asarray(taut)
+    faces = np.asarray(garment.mesh.faces)
+    # The inner side of a thick garment faces the skin.
+    outwards = smooth_normals(made[None], faces)[0] * np.asarray(garment.offset)
+    free = outwards.sum(axis=1) > 0.0
+    taut = jnp.asarray(bridge_hollows(np.asarray(carried), made, faces, free))
     mesh = dataclasses.replace(garment.mesh, vertices=taut)
     return dataclasses.replace(garment, mesh=mesh, offset=garment.offset + (taut - carried))
 

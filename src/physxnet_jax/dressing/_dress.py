@@ -35,7 +35,7 @@ from ._inference import Inference
 from ._meshes import Wear, animated_meshes, resolve_garments
 from ._simulate import EXTERNAL_ENGINES, Simulation, build_scene, run_simulation, with_floor
 from ._stages import Stage, timed
-from .postprocess import BodyCollider, make_colliders
+from .postprocess import BodyCollider, make_colliders, prepare_layers
 
 Method = Literal["network", "guided", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "guided", "lbs", "simulate")
@@ -133,7 +133,7 @@ def dress(
         method: ``guided`` (a network, and a few substeps of simulation drawn to it), ``network``
             (without those), ``lbs`` (skinning alone) or ``simulate`` (the cloth simulator).
         inference: Weights and post-processing of ``network`` and ``lbs``; ``collisions`` also
-            apply to cloth simulated on a character.
+            apply to cloth simulated on a character, guided or not.
         simulation: Options of ``simulate``, and effects and substeps of ``guided``.
         fps: Frames per second of the result.
         start: Start time within the motion [s].
@@ -187,6 +187,14 @@ def dress(
             )
         if not cloth.inside:
             cloth = _measured(cloth, dresser, person, colliders.result())
+    if method == "guided" and person.character is not None and inference.collisions:
+        # The simulation met the skinned body, not the character's own surface.
+        with on_processor():
+            dresser = dataclasses.replace(
+                dresser,
+                colliders=make_colliders(dresser.outfit),
+                layers=prepare_layers(dresser.outfit, inference),
+            )
     return _assemble_clip(dresser, person, cloth, method, include_body, notes, stages)
 
 

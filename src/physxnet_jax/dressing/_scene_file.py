@@ -12,7 +12,15 @@ from jaxtyping import Array, Float
 from ..body import load_body
 from ..errors import FormatError
 from ..files import add_inputs, atomic_write, is_file
-from ..garment import Garment, fabric_of, parse_wear, with_default_fabric, with_fabric
+from ..garment import (
+    FABRICS,
+    Garment,
+    fabric_of,
+    find_fabric,
+    parse_wear,
+    with_default_fabric,
+    with_fabric,
+)
 from ..io import split_part
 from ..motion import Motion, prepare_motion, sudden_turns
 from ..simulation import EFFECTS, PRESETS, Accuracy, Effect, Scene
@@ -119,7 +127,12 @@ def _scene_keys(
     for w in words:
         item = parse_wear(w)
         file = item.word(absolute(item.name))
-        garments.append({"file": file} | ({"fabric": item.fabric} if item.fabric else {}))
+        fabric: Any = item.fabric
+        if fabric is not None and fabric not in FABRICS:
+            # The scene holds the numbers of a fabric's file.
+            numbers = dataclasses.asdict(find_fabric(fabric))
+            fabric = {k: v for k, v in numbers.items() if v is not None}
+        garments.append({"file": file} | ({"fabric": fabric} if fabric else {}))
     keys = {"motion": absolute(motion), "garments": garments}
     for name, value in options.items():
         if value is not None:

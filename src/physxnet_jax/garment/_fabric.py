@@ -36,13 +36,18 @@ def find_fabric(word: str | pathlib.Path) -> Fabric:
             f"No fabric '{word}'; there are {', '.join(FABRICS)}, and files that end in .toml."
         )
     try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise FormatError(f"{path}: too large for a fabric; it has lines like density = 0.2.")
-        return fabric_of(tomllib.loads(path.read_text(encoding="utf-8")))
+        size = path.stat().st_size
+        text = path.read_text(encoding="utf-8") if size <= _MOST_BYTES else ""
     except OSError as error:
         raise FormatError(f"{path}: {error.strerror or error}.") from None
     except ValueError as error:
         raise FormatError(f"{path}: {error}.") from None
+    if size > _MOST_BYTES:
+        raise FormatError(f"{path}: too large for a fabric; it has lines like density = 0.2.")
+    try:
+        return fabric_of(tomllib.loads(text))
+    except (ValueError, OverflowError, RecursionError) as error:
+        raise FormatError(f"{path}: {error}."[:300]) from None
 
 
 def fabric_of(settings: str | Mapping[str, Any]) -> Fabric:
@@ -63,7 +68,7 @@ def fabric_of(settings: str | Mapping[str, Any]) -> Fabric:
         settings = {"base": settings}
     numbers = dict(settings)
     base = numbers.pop("base", "cotton")
-    if base not in FABRICS:
+    if not isinstance(base, str) or base not in FABRICS:
         raise ValueError(f"no fabric '{base}'; there are {', '.join(FABRICS)}")
     known = [f.name for f in dataclasses.fields(Fabric)]
     unknown = sorted(set(numbers) - set(known))

@@ -128,6 +128,10 @@ def with_default_fabric(words: Sequence[str], fabric: str | None) -> tuple[str, 
     if fabric is None:
         return tuple(words)
     find_fabric(fabric)
+    if any(sign in fabric for sign in ":,="):
+        raise PhysXNetError(
+            f"{fabric}: give the fabric's file a path without ':', ',' and '=', as in fabric.toml."
+        )
     out = []
     for word in words:
         item = parse_wear(word)

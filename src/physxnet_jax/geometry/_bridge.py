@@ -2,7 +2,7 @@
 
 import numpy as np
 import scipy.sparse as sp
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from ._topology import boundary_loops, mesh_edges, smoothing_matrix
 
@@ -18,6 +18,7 @@ def bridge_hollows(
     vertices: Float[np.ndarray, "vertices 3"],
     made: Float[np.ndarray, "vertices 3"],
     faces: Int[np.ndarray, "faces 3"],
+    free: Bool[np.ndarray, " vertices"] | None = None,
 ) -> Float[np.ndarray, "vertices 3"]:
     """Moves cloth that was carried to another body out of hollows that it wasn't made with.
 
@@ -29,6 +30,8 @@ def bridge_hollows(
         vertices: Positions on the other body [m].
         made: Positions on the body that the garment was made on [m].
         faces: Triangles; they face outwards.
+        free: Vertices that may move; all by default. Those of a thick garment's inner side, whose
+            normals point to the body, must not.
 
     Returns:
         Positions [m]; those of `vertices` where the cloth has no new hollow.
@@ -39,7 +42,7 @@ def bridge_hollows(
     """
     n = len(vertices)
     around = smoothing_matrix(faces, n)
-    free = np.ones(n, bool)
+    free = np.ones(n, bool) if free is None else free.copy()
     for loop in boundary_loops(faces):
         free[loop] = False
     start, before = np.asarray(vertices, np.float64), np.asarray(made, np.float64)

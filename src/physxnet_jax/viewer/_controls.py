@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 import re
+import shutil
 from collections.abc import Callable
 from typing import Any
 
@@ -60,6 +61,7 @@ class Controls:
         self.shapes: dict[str, Any] = {}
         self._gui, self._initial, self._folder = gui, choice, folder
         self._uploads: dict[str, int] = {}
+        self._received = 0
         self._skeleton: pathlib.Path | None = None
         self._changed: Callable[[], None] = lambda: None
         self.status = gui.add_markdown("loading …")
@@ -164,12 +166,18 @@ class Controls:
                 f" and all of a session {_MOST_KEPT / 1e6:.0f} MB."
             )
         # Each in a folder of its own: a name that is used again must not touch another file.
-        folder = self._folder / f"{len(self._uploads):04d}"
+        self._received += 1
+        folder = self._folder / f"{self._received:04d}"
         folder.mkdir()
         path = folder / name
         path.write_bytes(content)
+        try:
+            kinds = () if suffix == ".asf" else _kinds(path)
+        except Exception:
+            shutil.rmtree(folder)
+            raise
         label = name
-        while label in self.files or label in CLIPS or label in TEMPLATES:
+        while label in (*self.files, *self._uploads, *CLIPS, *TEMPLATES, *FABRICS):
             stem, n = re.fullmatch(r"(.*?)(?: \((\d+)\))?", label, re.DOTALL).groups()  # pyright: ignore[reportOptionalMemberAccess]
             label = f"{stem} ({int(n or 1) + 1})"
         self._uploads[label] = len(content)
@@ -177,7 +185,6 @@ class Controls:
             # The AMC file that needs it may already be there.
             self._skeleton = path
             return
-        kinds = _kinds(path)
         self.files[label] = path
         if "garment" in kinds:
             with self._garments:
@@ -219,9 +226,7 @@ class Controls:
         wind_range = (-strongest, strongest, 0.5)
         fabrics, fabric = (_AS_CUT, *FABRICS), choice.fabric or _AS_CUT
         if fabric not in fabrics:
-            path = pathlib.Path(fabric)
-            fabric = fabric if path.name in self.files else path.name
-            self.files[fabric] = path
+            fabric = self._named(pathlib.Path(fabric))
             fabrics = (*fabrics, fabric)
         w["fabric"] = gui.add_dropdown("fabric", fabrics, initial_value=fabric)
         w["wind_x"] = gui.add_slider("wind from the right, m/s", *wind_range, wind[0])
@@ -254,9 +259,7 @@ class Controls:
     def _add_body(self, choice: Choice) -> None:
         people, person = (_BUILT_IN,), _BUILT_IN
         if choice.character is not None:
-            path = choice.character
-            person = str(path) if path.name in self.files else path.name
-            self.files[person] = path
+            person = self._named(choice.character)
             people = (_BUILT_IN, person)
         self.settings["person"] = self._gui.add_dropdown("person", people, initial_value=person)
         body, overrides = load_body(), dict(choice.shape)
@@ -265,6 +268,15 @@ class Controls:
             self.shapes[name] = self._gui.add_slider(
                 name.replace("_", " "), min(0.0, value), max(1.0, value), 0.05, value
             )
+
+    def _named(self, path: pathlib.Path) -> str:
+        """A name for a file of the command, which no other file has."""
+        name, n = path.name, 1
+        while name in self.files:
+            n += 1
+            name = f"{path.name} ({n})"
+        self.files[name] = path
+        return name
 
     def _add_garment(self, name: str, worn: bool) -> None:
         box = self._gui.add_checkbox(name, worn)

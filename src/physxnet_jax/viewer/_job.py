@@ -26,8 +26,9 @@ from ..dressing import (
     make_scene,
     run_simulation,
 )
-from ..errors import PhysXNetError
+from ..errors import FormatError, PhysXNetError
 from ..evaluation import load_cost_table, method_name, parse_method
+from ..files import is_file
 from ..garment import find_fabric, with_default_fabric
 from ..io import AnimatedMesh
 from ..models import read_card
@@ -150,6 +151,8 @@ def check_choice(choice: Choice) -> None:
         raise PhysXNetError(f"frames is {choice.frames}; it must be at least one.")
     if choice.fabric is not None:
         find_fabric(choice.fabric)
+    if choice.character is not None and not is_file(choice.character):
+        raise FormatError(f"{choice.character}: no such file. Check the path.")
     _shape(choice)
     if choice.method in ("network", "guided"):
         read_card(str(choice.inference.weights))
@@ -168,7 +171,9 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     check_choice(choice)
     # A page may stay open for days.
     clear_caches_if_full()
-    body, shape, character = load_body(), _shape(choice), None
+    # A character has a shape of its own.
+    body, character = load_body(), None
+    shape = None if choice.character is not None else _shape(choice)
     clip = prepare_motion(
         choice.motion,
         fps=choice.fps,
@@ -184,7 +189,7 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     person: Motion | Character = clip
     if choice.character is not None:
         person = character = _moved(choice.character, clip, progress)
-        body, shape = character.body, None
+        body = character.body
         clip = character.motion.moved(character.place)
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     if shape is not None:
@@ -239,7 +244,8 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
 
 def _moved(path: pathlib.Path, clip: Motion, progress: Progress | None) -> Character:
     """The character in a motion; fitting the body to it takes longer than most changes."""
-    key = path, path.stat().st_mtime_ns, clip.name, clip.fps, np.asarray(clip.root).tobytes()
+    poses = (np.asarray(x).tobytes() for x in (clip.rotations, clip.root))
+    key = path, path.stat().st_mtime_ns, clip.fps, *poses
     if _FITTED.get("key") != key:
         _FITTED["character"] = load_character(path, fps=clip.fps, motion=clip, progress=progress)
         _FITTED["key"] = key
