@@ -190,15 +190,16 @@ def test_cloth_is_moved_out_of_the_character_surface(character):
 
 @pytest.mark.release
 def test_guided_cloth_is_moved_out_of_the_character_surface(character):
-    """Narrow rings around the thighs, which the simulation of the skinned body doesn't see."""
+    """Waves on the thighs, which the simulation of the skinned body doesn't see."""
     body, clip = character.body, character.motion
     rest = body.rest_vertices(body.default_shape())
     skin = np.asarray(rest)[:13380]
-    ring = np.exp(-0.5 * ((skin[:, 1] - skin[:, 1].min() - 0.65) / 0.012) ** 2)
+    high = skin[:, 1] - skin[:, 1].min()
+    ring = np.sin(2 * np.pi * high / 0.06) * (np.abs(high - 0.65) < 0.12)
     outward = np.asarray(vertex_normals(jnp.asarray(skin), body.rest_mesh().faces))
     world, _ = clip_transforms(body, rest, clip)
     weights = np.asarray(body.weights)[:13380]
-    grown = 0.05 * np.einsum("vj,fjab,vb->fva", weights, world, outward) * ring[:, None]
+    grown = 0.02 * np.einsum("vj,fjab,vb->fva", weights, world, outward) * ring[:, None]
     grown = grown.astype(np.float32)
     ringed = dataclasses.replace(
         character, residual=grown, surface=np.asarray(body_animation(body, clip)) + grown
