@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from .._environment import clear_caches_if_full
 from ..body import NUM_BODY_VERTICES, Body, load_body
-from ..devices import on_processor
+from ..devices import on_processor, prepared_on_processor
 from ..errors import PhysXNetError
 from ..files import claim
 from ..frames import FrameStore, in_chunks, moved_frames
@@ -188,13 +188,7 @@ def dress(
         if not cloth.inside:
             cloth = _measured(cloth, dresser, person, colliders.result())
     if method == "guided" and person.character is not None and inference.collisions:
-        # The simulation met the skinned body, not the character's own surface.
-        with on_processor():
-            dresser = dataclasses.replace(
-                dresser,
-                colliders=make_colliders(dresser.outfit),
-                layers=prepare_layers(dresser.outfit, inference),
-            )
+        dresser = _with_contacts(dresser, inference)
     return _assemble_clip(dresser, person, cloth, method, include_body, notes, stages)
 
 
@@ -377,6 +371,17 @@ def _infer_cloth(
     )
 
 
+@prepared_on_processor
+def _with_contacts(dresser: Dresser, inference: Inference) -> Dresser:
+    """A dresser of guided cloth that keeps it off a character's own surface.
+
+    The simulation met the skinned body alone.
+    """
+    outfit = dresser.outfit
+    layers = prepare_layers(outfit, inference)
+    return dataclasses.replace(dresser, colliders=make_colliders(outfit), layers=layers)
+
+
 def _colliders(dresser: Dresser, person: _Person) -> tuple[BodyCollider, ...]:
     """Colliders by which penetration is measured, with their programs compiled."""
     if person.character is not None:
@@ -420,26 +425,22 @@ def _assemble_clip(
     character, clip, rollout = person.character, person.clip, cloth.rollout
     worst = {}
     begun = time.perf_counter()
+    positions = {n: moved_frames(x, person.place) for n, x in cloth.positions.items()}
+    if rollout is not None:
+        rollout = dataclasses.replace(rollout, positions=tuple(positions.values()))
     if character is not None:
-        raw, positions = dress_character(character, dresser, clip, cloth.positions)
+        raw, worn = dress_character(character, dresser, clip, cloth.positions)
         inside_raw, inside = (
             {n: character_penetration(character, x) for n, x in part.items()}
-            for part in (raw, positions)
+            for part in (raw, worn)
         )
+        positions = {n: moved_frames(x, person.place) for n, x in worn.items()}
     else:
         inside_raw, inside = (
             {n: float(shares[k].mean()) for n, shares in cloth.inside.items()} for k in (0, 1)
         )
         for n, (_, shares) in cloth.inside.items():
             worst[n] = (int(shares.argmax()), float(shares.max()))
-        positions = cloth.positions
-    positions = {n: moved_frames(x, person.place) for n, x in positions.items()}
-    if rollout is not None:
-        # On a character the rollout is the simulation before collisions with its surface.
-        simulated = cloth.positions if character is not None else positions
-        place = person.place if character is not None else np.zeros(3, np.float32)
-        there = tuple(moved_frames(x, place) for x in simulated.values())
-        rollout = dataclasses.replace(rollout, positions=there)
     meshes = animated_meshes(
         person.body, clip.motion, person.shape, dresser.garments, positions, include_body
     )

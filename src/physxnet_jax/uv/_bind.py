@@ -29,6 +29,9 @@ _MAX_DISTANCE: dict[Template, float] = {"top": 0.08, "bottom": 0.08, "dress": 0.
 # A ray hit more than this many times as far as the closest point lies on another limb.
 _MAX_DISTANCE_RATIO = 2.0
 
+# Above this number of vertices, rays are cast block by block.
+_MANY = 8192
+
 
 @pytree
 @dataclasses.dataclass(frozen=True)
@@ -224,8 +227,15 @@ def _hits(
     face, weights, squared = _closest(mesh, points)
     reach = _MAX_DISTANCE_RATIO * np.sqrt(squared) + 0.01
     reach = np.minimum(reach, _MAX_DISTANCE[garment.template])
-    hits = cast_rays_within(mesh, points, normals, reach)
-    distance, ray_face, ray_weights = map(np.asarray, (hits.distance, hits.face, hits.weights))
+    if len(points) > _MANY:
+        hits = cast_rays_within(mesh, points, normals, reach)
+    else:
+        padded = (jnp.asarray(padded_rows(x)) for x in (points, normals))
+        most = _MAX_DISTANCE[garment.template]
+        hits = cast_rays(mesh, *padded, both=True, max_distance=most)
+    distance, ray_face, ray_weights = (
+        np.asarray(x)[: len(points)] for x in (hits.distance, hits.face, hits.weights)
+    )
     good = np.abs(distance) <= reach
     face = np.where(good, ray_face, face)
     return good, face, np.where(good[:, None], ray_weights, weights)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._environment import clear_caches_if_full
-from ..body import load_body
+from ..body import Body, load_body
 from ..dressing import (
     INFERENCE_STAGES,
     Character,
@@ -171,30 +171,11 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     check_choice(choice)
     # A page may stay open for days.
     clear_caches_if_full()
+    person, body, clip = _person(choice, progress)
+    character = person if isinstance(person, Character) else None
     # A character has a shape of its own.
-    body, character = load_body(), None
-    shape = None if choice.character is not None else _shape(choice)
-    clip = prepare_motion(
-        choice.motion,
-        fps=choice.fps,
-        start=choice.start,
-        frames=choice.frames,
-        source_fps=choice.source_fps,
-        skeleton=choice.skeleton,
-        up=choice.up,
-        joint_map=choice.joint_map,
-        body=body,
-        shape=shape,
-    )
-    person: Motion | Character = clip
-    if choice.character is not None:
-        person = character = _moved(choice.character, clip, progress)
-        body = character.body
-        clip = character.motion.moved(character.place)
+    shape = None if character is not None else _shape(choice)
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
-    if shape is not None:
-        # As in `dress`, after slicing: the lowest foot of the clip is on the floor.
-        person = clip = stand_on_floor(body, clip, rest)
     garments: tuple[AnimatedMesh, ...] = ()
     reference: tuple[AnimatedMesh, ...] = ()
     lines = [f"{clip.num_frames} frames at {clip.fps:g} fps"]
@@ -242,6 +223,35 @@ def run_job(choice: Choice, progress: Progress | None = None) -> Shown:
     )
 
 
+# The last character, and what it was made from.
+_FITTED: dict[str, Any] = {}
+
+
+def _person(choice: Choice, progress: Progress | None) -> tuple[Motion | Character, Body, Motion]:
+    """Who is dressed, the body that is or follows them, and its motion."""
+    shape = None if choice.character is not None else _shape(choice)
+    body = load_body()
+    clip = prepare_motion(
+        choice.motion,
+        fps=choice.fps,
+        start=choice.start,
+        frames=choice.frames,
+        source_fps=choice.source_fps,
+        skeleton=choice.skeleton,
+        up=choice.up,
+        joint_map=choice.joint_map,
+        body=body,
+        shape=shape,
+    )
+    if choice.character is not None:
+        character = _moved(choice.character, clip, progress)
+        return character, character.body, character.motion.moved(character.place)
+    if shape is not None:
+        # As in `dress`, after slicing: the lowest foot of the clip is on the floor.
+        clip = stand_on_floor(body, clip, body.rest_vertices(shape))
+    return clip, body, clip
+
+
 def _moved(path: pathlib.Path, clip: Motion, progress: Progress | None) -> Character:
     """The character in a motion; fitting the body to it takes longer than most changes."""
     poses = (np.asarray(x).tobytes() for x in (clip.rotations, clip.root))
@@ -250,10 +260,6 @@ def _moved(path: pathlib.Path, clip: Motion, progress: Progress | None) -> Chara
         _FITTED["character"] = load_character(path, fps=clip.fps, motion=clip, progress=progress)
         _FITTED["key"] = key
     return _FITTED["character"]
-
-
-# The last character, and what it was made from.
-_FITTED: dict[str, Any] = {}
 
 
 def _dressed(
