@@ -1,11 +1,12 @@
 """Draws the tailor's charts and the patterns of every kind at its usual measures, and stores them.
 
-Command: python experiments/build_tailor.py
-Cost:    four minutes.
-Result:  src/physxnet_jax/garment/assets/charts_cc0.npz and patterns_cc0.npz, the same bytes with
-         the same library versions, and the table of kinds in docs/garments.md.
+Command: python experiments/build_tailor.py [--cuts]
+Cost:    four minutes; with --cuts, which cuts from the patterns that are stored, two.
+Result:  src/physxnet_jax/garment/assets/charts_cc0.npz, patterns_cc0.npz and cuts_cc0.npz, the same
+         bytes with the same library versions, and the table of kinds in docs/garments.md.
 """
 
+import argparse
 import pathlib
 
 import numpy as np
@@ -16,8 +17,10 @@ from physxnet_jax.garment.tailoring import (
     KINDS,
     MEASURES,
     build_charts,
+    cut_usual,
     draw_usual_pattern,
     measure_usual_arm,
+    stored_arrays,
 )
 
 OUT = pathlib.Path("src/physxnet_jax/garment/assets")
@@ -45,12 +48,25 @@ def kinds_table() -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> None:
+def draw() -> None:
+    """Draws the charts and the patterns."""
     write("charts_cc0.npz", build_charts(load_body()))
     patterns: dict[str, np.ndarray] = {"usual_arm": np.asarray(measure_usual_arm())}
     for name in track(KINDS, description="patterns"):
         patterns |= draw_usual_pattern(name)
     write("patterns_cc0.npz", patterns)
+    stored_arrays.cache_clear()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cuts", action="store_true", help="keep the charts and the patterns")
+    if not parser.parse_args().cuts:
+        draw()
+    cuts: dict[str, np.ndarray] = {}
+    for name in track(KINDS, description="cuts"):
+        cuts |= cut_usual(name)
+    write("cuts_cc0.npz", cuts)
     page = pathlib.Path("docs/garments.md")
     before, mark, rest = page.read_text().partition("<!-- begin tailor -->\n")
     end = rest[rest.index("<!-- end tailor -->") :]

@@ -8,6 +8,7 @@ import trimesh
 
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.garment import KINDS, clearance, cut_vertices, tailor
+from physxnet_jax.garment.tailoring import resolve_measures
 from physxnet_jax.garment.tailoring._charts import load_charts
 from physxnet_jax.geometry import (
     boundary_loops,
@@ -272,6 +273,36 @@ def test_stored_patterns_are_those_that_are_drawn():
         assert value.shape == stored[key].shape, key
         if value.dtype.kind == "f":
             np.testing.assert_allclose(value, stored[key], atol=1e-4, err_msg=key)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["shorts", *(pytest.param(n, marks=pytest.mark.nightly) for n in KINDS if n != "shorts")],
+)
+def test_stored_cuts_are_those_that_are_cut(body, name):
+    from physxnet_jax.garment.tailoring._cut import class_of, cut, pattern_of, stored_cut
+    from physxnet_jax.garment.tailoring._measures import kind_of
+
+    rest = body.rest_vertices(body.default_shape())
+    measures = resolve_measures(name, {})
+    vertices, places = stored_cut(name, measures, rest)
+    made, on_chart = cut(name, pattern_of(name, class_of(kind_of(name), measures)), measures, rest)
+    # Another processor may round otherwise.
+    np.testing.assert_allclose(vertices, made, atol=2e-5)
+    assert list(places) == list(on_chart)
+    for key, place in places.items():
+        np.testing.assert_allclose(place, on_chart[key], atol=1e-4)
+
+
+def test_stored_cuts_are_for_their_own_measures_and_body(body):
+    from physxnet_jax.garment.tailoring._cut import stored_cut
+
+    rest = body.rest_vertices(body.default_shape())
+    assert stored_cut("shorts", resolve_measures("shorts", {}), rest) is not None
+    assert stored_cut("shorts", resolve_measures("shorts", {"ease": 0.12}), rest) is None
+    taller = body.rest_vertices(body.default_shape().at[0].add(0.1))
+    assert stored_cut("shorts", resolve_measures("shorts", {}), taller) is None
+    assert stored_cut("shorts", resolve_measures("shorts", {}), rest[1:]) is None
 
 
 @pytest.mark.release

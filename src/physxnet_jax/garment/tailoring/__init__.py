@@ -2,6 +2,7 @@
 
 from ._build import build_charts as build_charts
 from ._cut import (
+    cut_usual as cut_usual,
     cut_vertices as cut_vertices,
     draw_usual_pattern as draw_usual_pattern,
     measure_usual_arm as measure_usual_arm,
@@ -14,4 +15,5 @@ from ._measures import (
     Kind as Kind,
     Range as Range,
 )
+from ._pattern import stored_arrays as stored_arrays
 from ._tailor import tailor as tailor

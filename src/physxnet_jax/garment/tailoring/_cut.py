@@ -17,9 +17,11 @@ from ._curves import rings
 from ._form import WAIST, Form, heights, make_form, place, ring_points
 from ._measures import Kind, kind_of
 from ._pattern import (
+    CUTS,
     Pattern,
     draw_pattern,
     pattern_arrays,
+    stored_arrays,
     stored_number,
     stored_pattern,
     with_borders,
@@ -255,6 +257,37 @@ def cut(
     total = jnp.zeros((pattern.num_vertices, 3), jnp.float32)
     vertices = total.at[pattern.owner].add(jnp.concatenate(parts)) / count[:, None]
     return _level_borders(kind, pattern, vertices, hem), places
+
+
+def stored_cut(
+    name: str, measures: Mapping[str, Array], rest: Float[Array, "all 3"]
+) -> tuple[Float[Array, "vertices 3"], dict[str, Array]] | None:
+    """What `cut` gives for a kind's own measures on the built-in body, without compiling it.
+
+    None for other measures or another body, and where the package has no such file.
+    """
+    arrays = stored_arrays(CUTS)
+    ranges = kind_of(name).ranges
+    body = load_body()
+    if (
+        f"{name}/vertices" not in arrays
+        or any(float(x) != np.float32(ranges[k].default) for k, x in measures.items())
+        or not np.array_equal(rest, body.rest_vertices(body.default_shape()))
+    ):
+        return None
+    start = f"{name}/places/"
+    places = {k[len(start) :]: jnp.asarray(v) for k, v in arrays.items() if k.startswith(start)}
+    return jnp.asarray(arrays[f"{name}/vertices"]), places
+
+
+def cut_usual(name: str) -> dict[str, np.ndarray]:
+    """Cuts a kind with its own measures on the built-in body, as arrays of the package's file."""
+    body = load_body()
+    measures = resolve_measures(name, {})
+    pattern = pattern_of(name, class_of(kind_of(name), measures))
+    vertices, places = cut(name, pattern, measures, body.rest_vertices(body.default_shape()))
+    out = {f"{name}/vertices": np.asarray(vertices)}
+    return out | {f"{name}/places/{k}": np.asarray(v) for k, v in places.items()}
 
 
 def _level_borders(

@@ -19,6 +19,7 @@ from ._mesher import mesh_polygon
 from ._outline import SKIRT_QUARTER
 
 ASSET = "patterns_cc0.npz"
+CUTS = "cuts_cc0.npz"
 # Length of edges of a pattern [m].
 EDGE = 0.0145
 # Vertices nearer to a border than this follow when it is levelled [m].
@@ -314,8 +315,9 @@ def pattern_arrays(name: str, pattern: Pattern) -> dict[str, np.ndarray]:
 
 
 @functools.cache
-def _stored() -> dict[str, np.ndarray]:
-    resource = importlib.resources.files("physxnet_jax.garment") / "assets" / ASSET
+def stored_arrays(asset: str) -> dict[str, np.ndarray]:
+    """Arrays of one of the package's files; none if it isn't there."""
+    resource = importlib.resources.files("physxnet_jax.garment") / "assets" / asset
     with importlib.resources.as_file(resource) as path:
         if not path.is_file():
             return {}
@@ -325,13 +327,13 @@ def _stored() -> dict[str, np.ndarray]:
 
 def stored_number(name: str) -> float | None:
     """A number that the package stores beside the patterns; None if it isn't there."""
-    arrays = _stored()
+    arrays = stored_arrays(ASSET)
     return float(arrays[name]) if name in arrays else None
 
 
 def stored_pattern(name: str) -> Pattern | None:
     """The pattern of a kind's usual class from the package; None if it isn't there."""
-    arrays = _stored()
+    arrays = stored_arrays(ASSET)
     if f"{name}/owner" not in arrays:
         return None
 

@@ -13,7 +13,7 @@ from ...geometry import make_mesh
 from .._fabric import find_fabric
 from .._garment import Fabric, Garment, Template
 from ._charts import load_charts, place_table
-from ._cut import class_of, cut, pattern_of, resolve_measures
+from ._cut import class_of, cut, pattern_of, resolve_measures, stored_cut
 from ._flatten import flatten
 from ._grid import spline
 from ._measures import MEASURES, kind_of
@@ -77,7 +77,8 @@ def tailor(
         if name not in pattern.loops:
             raise PhysXNetError(f"{kind} has no {name} to hold; it has {', '.join(pattern.loops)}.")
     rest = body.rest_vertices(shape)
-    vertices, places = cut(kind, pattern, measures, rest)
+    stored = stored_cut(kind, measures, rest)
+    vertices, places = cut(kind, pattern, measures, rest) if stored is None else stored
     refs, weights, skin = _attachment(pattern, places, body)
     offset = vertices - jnp.sum(rest[refs] * weights[..., None], axis=1)
     uv, uv_faces = _pattern_places(pattern, np.asarray(vertices, np.float64))
