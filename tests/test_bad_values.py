@@ -249,6 +249,7 @@ def test_unparsable_toml_files_are_refused(tmp_path, text):
         load_scene(tmp_path / "a.toml")
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "line",
     [

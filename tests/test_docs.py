@@ -89,6 +89,7 @@ def test_reference_pages_are_those_that_the_program_makes():
     assert not blank
 
 
+@pytest.mark.release
 def test_the_scene_schema_fits_the_program(tmp_path):
     """What the schema names is read, and what it doesn't is refused."""
     schema = json.loads((ROOT / "docs/reference/scene.schema.json").read_text())
@@ -188,6 +189,7 @@ def test_cost_tables_match_the_measurements():
     assert {n.partition("+")[0] for n in named} <= set(list_weights())
 
 
+@pytest.mark.release
 def test_round_trip_errors_match_the_documented_table():
     """Written and read back here, with fewer frames; the table is the measured one."""
     told = (ROOT / "experiments/results/round_trips.md").read_text()

@@ -100,6 +100,7 @@ def test_rigid_root_motion_moves_all_vertices_rigidly(body):
     np.testing.assert_allclose(b, a @ turn.as_matrix().T + [1, 2, 3], atol=3e-6)
 
 
+@pytest.mark.release
 def test_vmap_matches_a_loop_and_gradients_match_finite_differences(body):
     rng = np.random.default_rng(1)
     poses = Rotation.from_rotvec(rng.normal(0, 0.3, (3 * 31, 3))).as_quat(scalar_first=True)

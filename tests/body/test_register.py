@@ -60,6 +60,7 @@ def test_registration_recovers_another_body_vertex_by_vertex(body, stranger):
     assert seen[-1][1] == seen[-1][2] and [t[1] for t in seen] == list(range(1, len(seen) + 1))
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("drawn", [True, False])
 def test_surface_reaches_what_protrudes(body, drawn, monkeypatch):
     rest = body.rest_vertices(body.default_shape())

@@ -262,6 +262,7 @@ def test_skeleton_and_source_rate_are_passed_to_the_reader(command, tmp_path, mo
     assert asked[0]["skeleton"] == pathlib.Path("b.asf") and asked[0]["source_fps"] == 60.0
 
 
+@pytest.mark.release
 def test_exported_rest_body_and_garments_reload_in_place(tmp_path, body, rest):
     assert main(["export-rest", "-o", str(tmp_path), "--wear", "top"]) == 0
     assert sorted(p.name for p in tmp_path.iterdir()) == ["body.obj", "top.obj"]
@@ -327,6 +328,7 @@ def test_conflicting_options_are_refused(words, said, capsys):
     assert said in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.release
 def test_missing_output_is_reported_and_start_selects_frames(capsys, tmp_path):
     words = ["dress", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "2"]
     assert main(words) == 0
@@ -365,6 +367,7 @@ def test_captured_bvh_wears_a_garment_file_and_exports_usd(data_dir, tmp_path, c
     assert 0.4 < height < 1.2, "in metres, on the dancer"
 
 
+@pytest.mark.release
 def test_brackets_in_paths_are_not_parsed_as_markup(tmp_path, capsys):
     out = tmp_path / "walk[v2][/].npz"
     assert main(["dress", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "2",

@@ -26,6 +26,7 @@ def inputs(tmp_path):
     return tmp_path
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "words",
     [

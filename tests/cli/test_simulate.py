@@ -102,6 +102,7 @@ def test_only_frames_can_override_a_scene_file(tmp_path, capsys):
     assert "leave --wear out" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.release
 def test_scene_files_define_garments_effects_and_motion(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text(TOML)
@@ -172,6 +173,7 @@ def test_options_an_engine_cannot_apply_are_refused(words, capsys):
     assert "leave" in capsys.readouterr().err
 
 
+@pytest.mark.release
 def test_garment_paths_resolve_relative_to_the_scene_file(tmp_path, monkeypatch):
     mesh = template("bottom").mesh
     (tmp_path / "in").mkdir()
@@ -212,6 +214,7 @@ def test_notes_of_garment_files_match_dress(tmp_path, capsys):
     ).notes
 
 
+@pytest.mark.release
 def test_resume_folder_with_other_files_is_neither_used_nor_removed(tmp_path):
     scene = prepare_scene(
         Scene((square_sheet(5, pinned=np.arange(5)),), (Gravity(), Stretch(), Pin()))
@@ -243,6 +246,7 @@ def test_motions_are_simulated_at_the_requested_rate():
         make_scene(spoiled, ["bottom"])
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -279,6 +283,7 @@ def test_wrong_scene_files_are_refused_with_a_fix(tmp_path, text, says):
         load_scene(path)
 
 
+@pytest.mark.release
 def test_resumed_rollout_matches_an_uninterrupted_one(tmp_path):
     scene = prepare_scene(
         Scene((square_sheet(5, pinned=np.arange(5)),), (Gravity(), Stretch(), Pin()))

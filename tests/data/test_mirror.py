@@ -12,6 +12,7 @@ FLIP = np.diag([-1.0, 1.0, 1.0])
 FIELD = np.array([[0.1, 0.2, -0.1], [0.0, 0.1, 0.3], [0.2, -0.2, 0.1]])
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", TEMPLATES)
 def test_mirrored_linear_field_matches_the_closed_form(name):
     """Offsets A x at x become F A F x: blending corners is exact for what is linear."""

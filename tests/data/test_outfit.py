@@ -69,6 +69,7 @@ def test_outfits_that_cannot_be_are_refused(words, says):
             DatasetConfig(outfits=(PAIR, ALONE), **more)
 
 
+@pytest.mark.release
 def test_every_action_has_its_share_of_the_outfits(mocap, tmp_path, monkeypatch):
     done = []
 

@@ -160,6 +160,7 @@ def test_builds_resume_and_refuse_another_solver(data_dir, tmp_path):
         build(DatasetConfig(templates=("bottom",), solver=XPBD(16, 1)))
 
 
+@pytest.mark.release
 def test_configuration_augments_the_actions(data_dir):
     body = load_body()
     train = [a for a in read_protocol(data_dir / "mocap") if a.split == "train"]
@@ -382,6 +383,7 @@ def test_actions_that_exceed_their_clip_are_refused(tmp_path):
             load_action(tmp_path, dataclasses.replace(action, **wrong))
 
 
+@pytest.mark.release
 def test_exploded_simulation_does_not_stop_a_build(tmp_path, monkeypatch):
     sheet = template("top")
     motion = load_motion("walk", fps=30)

@@ -90,6 +90,7 @@ def test_an_epoch_leaves_out_less_than_a_batch_of_each_group(lengths, capacity):
     assert set(seen.ravel()) == set(range(1, sum(lengths) + 1)), "sooner or later all are seen"
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("capacity", [1000, 24])
 def test_batches_depend_on_the_step_alone(capacity):
     whole = numbers(stream([10, 7, 5, 12, 6], capacity=capacity, mirrored=True), 0, 25)
@@ -116,6 +117,7 @@ def test_what_fits_is_read_once_and_what_does_not_in_parts():
     assert max(reads) == 20 and sum(reads) >= 160
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("capacity", [1000, 80])
 def test_a_process_reads_the_actions_of_its_own_rows(capacity):
     reads: list[int] = []

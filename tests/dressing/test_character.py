@@ -161,6 +161,7 @@ def test_cloth_follows_residual_skin_motion(character):
     assert np.abs(out[-1, :, :2]).max() < 1e-6
 
 
+@pytest.mark.release
 def test_cloth_is_moved_out_of_the_character_surface(character):
     """Thighs that swell by 2 cm while no cloth goes along."""
     body, clip = character.body, character.motion
@@ -214,6 +215,7 @@ def test_guided_cloth_is_moved_out_of_the_character_surface(character):
     assert found[True].inside["bottom"] < 0.5 * found[True].inside_raw["bottom"]
 
 
+@pytest.mark.release
 def test_near_skin_follows_sliding_cloth_but_not_to_another_limb(character):
     body = character.body
     rest = body.rest_vertices(body.default_shape())

@@ -77,6 +77,7 @@ def test_rate_and_frame_count_are_applied(clip, tmp_path):
     np.testing.assert_allclose(slow[::2], clip, atol=1e-6)
 
 
+@pytest.mark.release
 def test_rig_follows_a_retargeted_motion(body, rest, tmp_path):
     """The body's own mesh as a VRM: it goes where the body goes, to a millimetre."""
     walk = procedural_clip("walk", fps=10.0)
@@ -559,6 +560,7 @@ def test_an_obj_is_a_person_who_stands_still(tmp_path):
     np.testing.assert_allclose(np.ptp(person[0].positions[0, :, 1]), 1.7, atol=1e-5)
 
 
+@pytest.mark.release
 def test_the_body_of_a_stage_is_a_skeleton_with_one_mesh(tmp_path):
     """It moves as its vertices do, in a file that doesn't hold them."""
     usd = pytest.importorskip("pxr.Usd")

@@ -48,6 +48,7 @@ def fitted(body, rest, name):
     return bound, make_collider(body, rest, bound, g.mesh)
 
 
+@pytest.mark.release
 def test_collisions_lift_only_vertices_inside_the_body(body, rest, balance):
     bound, patch = fitted(body, rest, "bottom")
     x = skin_garment(bound, *balance)
@@ -135,6 +136,7 @@ def test_skirt_collision_gradients_in_a_stride_are_finite(body, rest, stride):
         assert np.isfinite(np.asarray(g)).all() and np.abs(np.asarray(g)).max() > 0
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", [pytest.param("bottom", marks=pytest.mark.nightly), "dress"])
 def test_map_frames_matches_a_batch(body, rest, name):
     """The way CPUs take against one batch; gradients where they compile quickly."""

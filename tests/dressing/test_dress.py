@@ -14,6 +14,7 @@ from physxnet_jax.motion import animate, load_motion
 from physxnet_jax.simulation import Scene, prepare_scene
 
 
+@pytest.mark.release
 def test_lbs_is_linear_blend_skinning(body, rest):
     motion = load_motion("punch", fps=30.0)
     clip = dress("punch", ["top"], method="lbs", frames=18, inference=Inference(collisions=False))
@@ -42,6 +43,7 @@ def test_network_cloth_differs_from_skinning_and_stays_near_the_body():
     assert {s.name for s in a.stages} >= {"motion", "binding", "network", "body"}
 
 
+@pytest.mark.release
 def test_clips_of_other_lengths_are_not_recompiled():
     dress("walk", ["bottom"], method="lbs", frames=3)
     programs = infer_block._cache_size()

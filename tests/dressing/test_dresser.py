@@ -41,6 +41,7 @@ def test_clothe_matches_dress(whole, motion):
     np.testing.assert_allclose(np.asarray(whole["bottom"]), positions, atol=1e-5)
 
 
+@pytest.mark.release
 def test_stream_matches_the_clip(dresser, whole, motion):
     step = jax.jit(clothe_step, static_argnames="fps", donate_argnames="stream")
     rotations, root = motion
@@ -230,6 +231,7 @@ def test_two_frame_clip_matches_the_start_of_a_longer_one(dresser, whole, motion
     np.testing.assert_allclose(cloth["bottom"], np.asarray(whole["bottom"])[0], atol=1e-5)
 
 
+@pytest.mark.release
 def test_poses_of_another_skeleton_are_refused_under_jit_too(dresser, motion):
     q, p = motion
     wrong = [(q[:, :22], p), (jnp.tile(q, (1, 2, 1)), p)]
@@ -249,6 +251,7 @@ def test_poses_of_another_skeleton_are_refused_under_jit_too(dresser, motion):
         with_shape(dresser, jnp.ones(5))
 
 
+@pytest.mark.release
 def test_dress_accepts_a_predictor_and_a_single_garment_name(dresser, motion):
     known = dresser.predictor
     clip = dress("walk", "bottom", method="network", inference=Inference(weights=known), frames=2)
@@ -339,6 +342,7 @@ print(len(jax.devices()), "devices")
     assert done.returncode == 0 and "2 devices" in done.stdout, done.stderr[-2000:]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("fps", [30.0, pytest.param(120.0, marks=pytest.mark.nightly)])
 def test_clip_starts_without_a_jump(fps):
     """Cloth accelerates in the first frames as in those after, however many there are a second."""

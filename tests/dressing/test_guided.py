@@ -93,6 +93,7 @@ def in_double(dresser):
     return dataclasses.replace(dresser, guided=scene)
 
 
+@pytest.mark.release
 def test_a_stream_gives_the_clip(guided, motion):
     """In float64: in float32 rounding decides which contacts are found, from the second frame."""
     with jax.enable_x64(True):

@@ -199,6 +199,7 @@ def test_non_finite_motions_are_refused_on_the_host(motion):
             dress(bad, ["bottom"], method="lbs")
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "values",
     [
@@ -215,6 +216,7 @@ def test_cloth_stays_near_extreme_body_shapes(motion, values):
     assert np.isfinite(gap).all() and np.linalg.norm(gap, axis=2).max() < FAR
 
 
+@pytest.mark.release
 def test_degenerate_triangle_does_not_change_other_triangles(motion):
     from physxnet_jax.garment import template
 

@@ -36,6 +36,7 @@ def saved(folder: pathlib.Path, name: str, vertices, faces, uv=None, uv_faces=No
     return path
 
 
+@pytest.mark.release
 def test_clean_garment_is_reported_ready(tmp_path, trousers):
     found = inspect_garment(saved(tmp_path, "a.obj", *trousers))
     assert (found.unit, found.up, found.template) == ("m", "Y", "bottom")
@@ -69,6 +70,7 @@ def test_all_faults_are_reported_and_repaired(tmp_path, trousers):
     assert path.read_text() != out.read_text(), "the file itself isn't changed"
 
 
+@pytest.mark.release
 def test_non_manifold_edge_is_a_note_and_not_a_problem(tmp_path, trousers):
     v, faces = trousers
     out = v[faces[5, :1]] + [[0.0, 0.0, 0.0]]
@@ -98,6 +100,7 @@ def test_template_of_a_file_can_be_specified(tmp_path):
         load_garment(f"{path}=hat")
 
 
+@pytest.mark.release
 def test_dressed_cloth_is_unchanged_by_fitting(tmp_path, trousers):
     v, faces = trousers
     path = saved(tmp_path, "inch.obj", v / 0.0254, faces)
@@ -140,6 +143,7 @@ def test_misplaced_mesh_is_aligned_to_the_template(tmp_path, trousers):
     assert np.percentile(np.linalg.norm(mended - v, axis=1), 90) < 0.005
 
 
+@pytest.mark.release
 def test_fitting_applies_the_requested_edge_lengths(tmp_path, trousers):
     pytest.importorskip("fast_simplification")
     path = saved(tmp_path, "a.obj", *trousers)
@@ -150,6 +154,7 @@ def test_fitting_applies_the_requested_edge_lengths(tmp_path, trousers):
     assert found.health.longest_edge < 0.055 and found.health.components == 1
 
 
+@pytest.mark.release
 def test_inspect_and_fit_commands_print_the_report(tmp_path, trousers, capsys):
     good, bad = (
         saved(tmp_path, "good.obj", *trousers),
@@ -184,6 +189,7 @@ def test_broken_files_are_refused(tmp_path, text):
     assert not (tmp_path / "out.obj").exists()
 
 
+@pytest.mark.release
 def test_real_garment_report_is_correct(data_dir):
     """Decimetres; torn nowhere, but some of it lies in our body."""
     found = inspect_garment(data_dir / "garments" / "tee.obj")
@@ -404,6 +410,7 @@ def test_garments_in_t_pose_are_moved_to_the_rest_pose(name, tmp_path, body, res
     assert plain[1].pose == "rest" and np.abs(np.asarray(plain[0].mesh.vertices) - x).max() < 2e-3
 
 
+@pytest.mark.release
 def test_real_garments_are_detected_in_the_rest_pose(data_dir):
     found = {p.stem: load_garment(p)[1].pose for p in (data_dir / "garments").glob("*.obj")}
     assert len(found) == 8 and set(found.values()) == {"rest"}
@@ -418,6 +425,7 @@ def test_edge_length_limit_holds_after_collision_resolution(tmp_path):
     assert after.health.longest_edge < 0.025 and after.command is None
 
 
+@pytest.mark.release
 def test_cape_in_metres_is_loaded_unchanged(tmp_path, body):
     skin = np.asarray(body.rest_mesh().vertices)
     back = skin[(np.abs(skin[:, 0]) < 0.03) & (np.abs(skin[:, 1] - 0.4) < 0.02), 2].min()

@@ -79,6 +79,7 @@ def test_inner_vertices_are_pressed_below_outer_triangles():
     np.testing.assert_allclose(resolve_layer(press, outer, under), under, atol=1e-7)
 
 
+@pytest.mark.release
 def test_vertices_beside_or_far_behind_are_unchanged():
     layer, low, high = sheets(0.0)
     beside = high + jnp.array([[0.5, 0.0, 0.0]])
@@ -107,6 +108,7 @@ def test_gradients_are_finite_at_zero_and_minimum_height(height):
     assert all(bool(jnp.isfinite(g).all()) for g in grads)
 
 
+@pytest.mark.release
 def test_layer_order_is_trousers_dresses_tops_then_as_named():
     body = load_body()
     rest = body.rest_vertices(body.default_shape())

@@ -59,6 +59,7 @@ def test_sixty_frames_a_second_are_every_other_of_thirty():
     assert clothe_step(dresser, stream, fast.rotations[0], fast.root[0], 60.0)[1].ok
 
 
+@pytest.mark.release
 def test_unrequested_steps_are_absent_from_the_program(motion):
     wear = ["top", "bottom"]
     plain = make_dresser(wear, inference=PLAIN)
@@ -122,6 +123,7 @@ def test_test_time_augmentation_is_an_option(motion):
     assert 1e-4 < float(jnp.abs(a - b).max()) < 0.1
 
 
+@pytest.mark.release
 def test_results_are_mappings_with_short_text(motion):
     dresser = make_dresser(["bottom"], inference=PLAIN)
     cloth = clothe(dresser, motion.rotations, motion.root, 30.0)

@@ -68,6 +68,7 @@ def check_apart(far, near, place):
     assert np.abs(away).max() <= 0.501 * np.spacing(np.float32(np.abs(place).max()))
 
 
+@pytest.mark.release
 def test_ten_kilometres_away_cloth_is_the_same(dresser, motion):
     far, near, place = far_and_near(motion)
     found, expected = (cloth_of(dresser, m.rotations, m.root) for m in (far, near))
@@ -112,6 +113,7 @@ def test_a_stream_follows_a_person_who_walks_away(dresser, motion):
 BAD = [0.0, 1e-13, 1e20, np.nan, np.inf]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("scale", BAD)
 def test_a_bad_pose_affects_its_window_alone(dresser, motion, scale):
     at, frames = 5, np.arange(FRAMES)
@@ -127,6 +129,7 @@ def test_a_bad_pose_affects_its_window_alone(dresser, motion, scale):
     np.testing.assert_allclose(streamed["bottom"], found["bottom"], atol=1e-5)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("which", ["rotations", "root", "first", "all"])
 def test_a_masked_loss_has_finite_gradients_in_all_other_frames(dresser, motion, which):
     q, p = motion.rotations, motion.root

@@ -185,6 +185,7 @@ def test_a_dressed_rig_moves_as_the_character_did(dressed):
     assert weights.shape == (9, 8) and np.allclose(weights[1:], np.eye(8), atol=1e-5)
 
 
+@pytest.mark.release
 def test_only_driven_rigs_are_written_and_only_as_glb(hero, tmp_path):
     person = px.load_character(hero, motion="walk", frames=2)
     with pytest.raises(FormatError, match=r"written as \.glb"):

@@ -46,6 +46,7 @@ def test_a_cut_replaces_the_rest_shape_of_its_garment():
         with_cut(dresser, {"tee": wide})
 
 
+@pytest.mark.release
 def test_only_simulated_cloth_has_a_fabric(guided):
     with pytest.raises(PhysXNetError, match="guided"):
         with_fabric(make_dresser(["shorts"], inference=NANO), bend=2.0)

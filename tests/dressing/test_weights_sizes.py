@@ -108,6 +108,7 @@ def test_one_frame_clip_is_treated_as_static(dresser, motion):
     assert np.isfinite(slope).all() and np.abs(slope).max() > 0
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "weights",
     [

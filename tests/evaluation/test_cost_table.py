@@ -121,6 +121,7 @@ def test_times_are_cached_for_each_machine(tmp_path):
         assert calibrate(profiles, worn[:1], path=path, frames=17)["lbs"]["bottom"] > 0
 
 
+@pytest.mark.release
 def test_times_of_another_process_are_kept(tmp_path):
     path = tmp_path / "times.json"
     one, other = (_Clock(path, 16) for _ in range(2))

@@ -93,6 +93,7 @@ def test_non_finite_frames_are_counted_and_excluded():
     assert lost[0].finite_share == 0.0 and np.isnan(lost[0].rmse_vertices_mm)
 
 
+@pytest.mark.release
 def test_clips_too_short_for_jerk_are_tabulated():
     rows = measure({"lbs": skinning()}, [sequence(frames=3)])
     assert rows[0].jitter_reference == 0.0
@@ -172,6 +173,7 @@ def test_check_detects_explosions_wrong_counts_and_stretched_cloth():
     assert {"strain, 99 %", "jerk relative to skinning"} <= wrong
 
 
+@pytest.mark.release
 def test_strain_and_fold_strength_are_compared_with_the_reference():
     rough = sequence(frames=6)
     rough.offsets["bottom"] += np.random.default_rng(0).normal(0, 2e-3, (6, BOTTOM, 3)).astype("f4")
@@ -203,6 +205,7 @@ def test_pinched_cloth_is_counted_separately(monkeypatch):
     assert row.penetration_mm == pytest.approx(2.0)
 
 
+@pytest.mark.release
 def test_retime_measures_only_times():
     one = sequence(frames=6)
     rows = measure({"lbs": skinning(), "other": skinning()}, [one])
@@ -211,6 +214,7 @@ def test_retime_measures_only_times():
     assert again == [dataclasses.replace(rows[0], ms_per_frame=77.0), rows[1]]
 
 
+@pytest.mark.release
 def test_check_detects_cloth_inside_the_body():
     sunk = sequence(frames=3)
     skinned = jnp.asarray(skinning()(sunk.motion, "bottom").positions)

@@ -63,6 +63,7 @@ def test_penetration_is_measured_at_selected_frames(standing):
     assert np.isnan(some.skin_outside).all()
 
 
+@pytest.mark.release
 def test_cloth_inside_another_limb_is_pinched(body, rest):
     """An arm pressed into the flank: both limbs' cloth is above its own skin, yet inside."""
     g = template("top")

@@ -34,6 +34,7 @@ def try_damages(name, folder, count):
     return refused
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", READERS)
 def test_damaged_files_are_read_or_refused(name, tmp_path):
     try_damages(name, tmp_path, READERS[name][3])

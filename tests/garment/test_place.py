@@ -73,6 +73,7 @@ def test_frames_of_known_bodies_are_found(kind, unit, pose, raised, turned, ward
     assert np.quantile(off, 0.95) < 0.035
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("kind", ["shirt", "trousers"])
 def test_garments_of_the_rest_pose_stay_exactly(kind, wardrobe):
     garment = wardrobe[kind]
@@ -82,6 +83,7 @@ def test_garments_of_the_rest_pose_stay_exactly(kind, wardrobe):
     assert (found.unit, found.up, found.pose, found.notes) == ("m", "Y", "rest", ())
 
 
+@pytest.mark.release
 def test_sleeves_follow_the_arms_out_of_a_t_pose(wardrobe):
     """Arms pass through the sleeves; the control: at rest no arm passes through them there."""
     garment = wardrobe["shirt"]

@@ -12,6 +12,7 @@ from physxnet_jax.garment import free_garment, refine_garment, square_sheet, tem
 from physxnet_jax.geometry import closest_points, make_mesh, mesh_edges
 
 
+@pytest.mark.release
 def test_vertices_stay_edges_shorten_and_everything_is_interpolated():
     coarse = template("bottom")
     fine = refine_garment(coarse, 0.012)

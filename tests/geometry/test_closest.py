@@ -91,6 +91,7 @@ def test_signs_are_correct_near_edges_and_corners_of_a_box():
     assert ((ours < 0) == inside).all()
 
 
+@pytest.mark.release
 def test_candidate_search_matches_brute_force(body):
     mesh = body.rest_mesh()
     rng = np.random.default_rng(2)

@@ -108,6 +108,7 @@ def test_strain_limiting_is_rigidly_equivariant_and_batches_match_a_loop(cloth):
     np.testing.assert_allclose(np.asarray(seen), np.asarray(out[0] @ turn.T + shift), atol=5e-6)
 
 
+@pytest.mark.release
 def test_gradients_match_finite_differences(cloth):
     vertices, _, springs = cloth
     rng = np.random.default_rng(2)
@@ -216,6 +217,7 @@ def test_degenerate_triangles_change_nothing(cloth):
     assert np.isfinite(np.asarray(limit_strain(double, 1.1 * x[:3], 3))).all()
 
 
+@pytest.mark.release
 def test_at_rest_takes_rest_lengths_from_another_shape(cloth):
     vertices, _, springs = cloth
     wider = jnp.asarray(1.5 * vertices)
@@ -240,6 +242,7 @@ def test_lengths_are_restored_far_from_the_origin(cloth):
     np.testing.assert_allclose(settled(springs, far, steps=8) - away, near, atol=1e-4)
 
 
+@pytest.mark.release
 def test_second_derivatives_are_finite(cloth):
     """Newton's methods and penalties on gradients ask for them."""
     vertices, _, springs = cloth

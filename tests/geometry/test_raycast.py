@@ -34,6 +34,7 @@ def test_random_rays_from_inside_never_leak(sphere):
     assert bool(hits.valid.all())
 
 
+@pytest.mark.release
 def test_hits_match_embree_on_100_000_random_rays(sphere):
     """The two differ only where a ray grazes an edge: by rounding."""
     mesh = trimesh.Trimesh(np.asarray(sphere.vertices), np.asarray(sphere.faces), process=False)

@@ -21,6 +21,7 @@ def sphere(rows=40, radius=1.0):
 SKIN, FACES = sphere()
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     ("scale", "share"),
     [(1.02, 0.0), (0.985, 1.0), (0.9, 0.0)],
@@ -30,6 +31,7 @@ def test_share_is_all_or_nothing_for_concentric_spheres(scale, share):
     assert visible_skin(SKIN, FACES, [(scale * SKIN, FACES)]).share == share
 
 
+@pytest.mark.release
 def test_share_grows_with_a_hole_that_skin_pokes_through():
     cloth = 1.02 * SKIN
     shares = []
@@ -48,6 +50,7 @@ def test_skin_beside_an_opening_does_not_count():
     assert seen.through == 0 and seen.covered > 10000
 
 
+@pytest.mark.release
 def test_only_counted_skin_counts():
     inner = [(0.985 * SKIN, FACES)]
     none = np.zeros(len(FACES), bool)

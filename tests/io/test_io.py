@@ -203,6 +203,7 @@ def test_real_garments_load_on_the_body(data_dir, name, kind):
     assert np.mean(distance < -1e-3) < 0.02
 
 
+@pytest.mark.release
 def test_meshes_far_from_the_body_are_refused(tmp_path):
     rng = np.random.default_rng(0)
     write_obj(tmp_path / "a.obj", rng.uniform(50, 60, (30, 3)), np.arange(30).reshape(10, 3))
@@ -212,6 +213,7 @@ def test_meshes_far_from_the_body_are_refused(tmp_path):
         load_garment(tmp_path / "a.fbx")
 
 
+@pytest.mark.release
 def test_loading_weights_draws_no_random_numbers():
     """As a fresh process has it: what is drawn is compiled first, which takes seconds."""
     code = "from physxnet_jax.models import load_predictor; load_predictor('nano')"
@@ -225,6 +227,7 @@ def test_loading_weights_draws_no_random_numbers():
     assert "Compiling jit(" in completed.stderr and "truncated_normal" not in completed.stderr
 
 
+@pytest.mark.release
 def test_packaged_weights_load_and_damage_is_detected(tmp_path):
     assert list_weights() == ["base", "nano", "paper", "small"]
     predictor = load_predictor("base")
@@ -302,6 +305,7 @@ def test_usd_stores_normals_extent_and_velocities_of_every_frame(tmp_path, clip)
         np.testing.assert_allclose(before, 24.0 * (m.positions[4] - m.positions[3]), rtol=1e-4)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_weights_and_cards_that_are_not_finite_are_refused(tmp_path, value):
     predictor = load_predictor("nano")

@@ -78,6 +78,7 @@ def test_obj_quads_and_materials_are_read(quilted):
     assert all(set(f) <= of[k] for f, k in zip(mesh.faces.tolist(), p.of_triangle))
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("suffix", [".usdc", ".obj", ".pc2", ".glb"])
 def test_polygons_and_materials_survive_writing(quilted, tmp_path, suffix):
     mesh = worn(quilted)
@@ -158,6 +159,7 @@ def test_decimation_keeps_materials_and_texture(quilted, tmp_path):
     assert np.median(gap) < 0.02 * np.ptp(whole.uv, axis=0).max()
 
 
+@pytest.mark.release
 def test_welding_and_flipping_keep_polygons(quilted, tmp_path):
     mesh = read_obj(quilted)
     assert mesh.polygons is not None
@@ -198,6 +200,7 @@ def test_invalid_or_outside_material_files_give_no_colour(quilted):
     assert p is not None and p.materials[1].colour is None
 
 
+@pytest.mark.release
 def test_a_lost_image_is_a_note(quilted, tmp_path):
     materials = tmp_path / "cloth.mtl"
     known = dress("walk", [quilted], method="lbs", frames=1)

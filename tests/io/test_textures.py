@@ -83,6 +83,7 @@ def test_obj_images_of_materials_are_read(painted):
     assert [m.colour for m in p.materials] == [None, None]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("suffix", [".usda", ".usdc", ".obj", ".pc2", ".glb"])
 def test_images_survive_writing(painted, tmp_path, suffix):
     mesh = worn(painted)

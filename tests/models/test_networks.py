@@ -41,6 +41,7 @@ from physxnet_jax.uv import bind, cloth_offsets, dress_body, garment_map_rows, m
 NHWC = ("NHWC", "HWIO", "NHWC")
 
 
+@pytest.mark.release
 def test_upsampling_equals_a_transposed_convolution_with_its_gradients():
     k = jax.random.normal(jax.random.key(0), (4, 4, 5, 7))
     x = jax.random.normal(jax.random.key(1), (2, 6, 8, 5))
@@ -100,12 +101,14 @@ def test_generator_computes_only_the_requested_decoders(size):
     assert flops(("dress",)) < 0.6 * flops(("top", "bottom", "dress"))
 
 
+@pytest.mark.release
 def test_map_sizes_not_divisible_by_16_are_refused():
     g = Generator(18, ("top",), width=2, rngs=nnx.Rngs(0))
     with pytest.raises(ValueError, match="multiples of 16"):
         g(jnp.zeros((1, 40, 32, 18)), ("top",))
 
 
+@pytest.mark.release
 def test_discriminator_output_is_a_patch_map():
     d = Discriminator(27, width=4, rngs=nnx.Rngs(0))
     out = d(jnp.zeros((2, 64, 64, 18)), jnp.zeros((2, 64, 64, 9)))
@@ -146,6 +149,7 @@ def transforms(body, rest, turn=None):
     return jnp.asarray(world), jnp.asarray(shift)
 
 
+@pytest.mark.release
 def test_only_local_features_are_invariant_to_heading(worn, body, rest):
     _, surface, _ = worn
     turn = Rotation.from_euler("Y", 1.1)
@@ -203,6 +207,7 @@ def test_features_of_a_window_equal_features_of_the_clip(worn, body, rest, input
     np.testing.assert_allclose(np.asarray(clip), np.asarray(each), atol=2e-2)
 
 
+@pytest.mark.release
 def test_stride_selects_whole_frames_of_the_history(worn, body, rest):
     """The oldest velocity of every third frame is that of six frames before."""
     _, surface, _ = worn
@@ -285,6 +290,7 @@ def test_zero_output_of_the_local_family_equals_skinning(worn, body, rest):
         np.testing.assert_array_equal(np.asarray(x), np.asarray(skinned))
 
 
+@pytest.mark.release
 def test_local_family_is_equivariant_to_heading(worn, body, rest):
     _, _, bound_garments = worn
     turn = Rotation.from_euler("Y", 0.8)
@@ -361,6 +367,7 @@ def test_only_features_beyond_the_limit_are_clipped(worn):
     assert np.isnan(np.asarray(normalise(x.at[0, 1].set(jnp.nan), scales, inputs))).any()
 
 
+@pytest.mark.release
 def test_folded_batch_norm_keeps_the_predictions(worn):
     atlas, surface, _ = worn
     predictor = trained_like(surface, atlas, LOCAL)

@@ -284,6 +284,7 @@ BROKEN = {
 }
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_gltf_files_are_refused(body, rest, tmp_path, name):
     (tmp_path / "secret.bin").write_bytes(b"secret" * 100)
@@ -310,6 +311,7 @@ def test_broken_gltf_files_are_refused(body, rest, tmp_path, name):
     assert "secret" not in str(error.value).replace("secret.bin", "")
 
 
+@pytest.mark.release
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(at=st.floats(0, 1), byte=st.integers(0, 255), length=st.integers(1, 40))
 def test_damaged_bytes_give_a_clip_or_a_motion_error(body, rest, tmp_path, at, byte, length):

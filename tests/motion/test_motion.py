@@ -62,6 +62,7 @@ def test_uniform_rotation_resamples_exactly(fps):
     np.testing.assert_allclose(np.asarray(out.root)[-1], [1, 0, 0], atol=1e-5)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", list(CLIPS))
 def test_built_in_clips_stand_on_the_floor_and_move_smoothly(name, body, rest):
     clip = load_motion(name, fps=30.0)
@@ -98,6 +99,7 @@ def test_hip_acceleration_exceeds_the_bound_without_smoothing(monkeypatch):
     assert along > 20.0 and up > 15.0
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", ["walk", "jump", "spin", "side step", "turn"])
 def test_built_in_clips_are_the_same_at_every_rate(name):
     """`walk` at 240 frames a second covers the ground that it covers at 10."""

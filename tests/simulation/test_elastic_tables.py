@@ -44,6 +44,7 @@ def padded(x, tables):
     return jnp.asarray(np.pad(x, [(0, most - len(x)), (0, 0)]), jnp.float32)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("k", [0, 1])
 def test_energy_is_that_of_the_effects(tables, k):
     scene = prepare_scene(Scene((SHEETS[k],), (Stretch(), Bend())))

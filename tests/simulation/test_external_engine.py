@@ -93,6 +93,7 @@ def test_missing_newton_error_names_the_environment_variable(monkeypatch):
         find_newton()
 
 
+@pytest.mark.release
 def test_peer_engines_are_evaluated_from_positions_only():
     """A simulator that leaves the trousers at rest, far from a spinning body."""
 

@@ -110,6 +110,7 @@ def test_a_step_of_backward_euler_minimises_it():
     assert bool(jnp.isfinite(state.position).all())
 
 
+@pytest.mark.release
 def test_gradient_agrees_with_differences_and_is_finite_where_cloth_collapses():
     with jax.enable_x64():
         solver = XPBD(precision="float64")

@@ -8,6 +8,7 @@ from hypothesis import given, settings, strategies as st
 from physxnet_jax.simulation._quantile import upper_quantile
 
 
+@pytest.mark.release
 @settings(max_examples=30, deadline=None)
 @given(
     st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), min_size=1, max_size=20),

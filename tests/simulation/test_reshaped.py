@@ -47,6 +47,7 @@ def test_reshaping_to_the_same_measures_changes_nothing(effects):
     np.testing.assert_allclose(same.inverse_mass, system.inverse_mass, rtol=1e-4)
 
 
+@pytest.mark.release
 def test_reshaping_gives_the_tables_of_a_new_scene(other):
     """Masses, lengths and stiffnesses; a scene that isn't reshaped has others."""
     rest = load_body().rest_vertices(load_body().default_shape())
@@ -78,6 +79,7 @@ def test_lengths_follow_measures_with_their_gradient():
     assert slope > 1.0
 
 
+@pytest.mark.release
 def test_what_cannot_be_reshaped_is_refused():
     body = load_body()
     rest = body.rest_vertices(body.default_shape())

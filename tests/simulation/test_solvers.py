@@ -83,6 +83,7 @@ def test_xpbd_of_order_2_has_a_fraction_of_the_error_of_order_1(reference, subst
     assert second < 0.35 * first
 
 
+@pytest.mark.release
 def test_free_fall_baseline_has_the_largest_error(reference):
     """The comparison itself: a sheet that only falls must land far off."""
     scene, truth = reference
@@ -132,6 +133,7 @@ def test_solver_at_rate_makes_cloth_independent_of_the_frame_rate():
         assert (np.abs(seldom - often[2::3]).max() < 1e-5) == same
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("order", [1, 2])
 def test_implicit_steps_of_one_second_are_finite(order):
     scene = swinging()

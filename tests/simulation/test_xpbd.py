@@ -312,6 +312,7 @@ def test_company_in_the_batch_changes_no_bit():
         np.testing.assert_array_equal(runs[0], other)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("order", [1, 2])
 def test_company_changes_no_bit_of_an_implicit_step(order):
     """Company that needs more iterations of the linear solver, or never ends."""

@@ -75,6 +75,7 @@ def trained(walk, tmp_path_factory):
     return predictor, folder
 
 
+@pytest.mark.release
 def test_custom_network_trains_and_dresses(trained):
     predictor, folder = trained
     lines = [json.loads(x) for x in (folder / "metrics.jsonl").read_text().splitlines()]
@@ -97,6 +98,7 @@ def test_custom_network_trains_and_dresses(trained):
     assert np.isfinite(network(inference)(motion, "bottom").positions).all()
 
 
+@pytest.mark.release
 def test_custom_network_is_saved_and_loaded(trained, tmp_path):
     predictor, _ = trained
     save_predictor(tmp_path / "w", predictor, name="w")

@@ -59,6 +59,7 @@ def learned(tmp_path_factory):
     return train(CONFIG, [sequence(TIGHT, 0.0), sequence(LOOSE, -OFF)], folder)
 
 
+@pytest.mark.release
 def test_garments_and_persons_are_numbered_once():
     w = make_wardrobe([TIGHT, LOOSE, TIGHT, dataclasses.replace(TIGHT)], ("top", "bottom"))
     assert len(w.garments["top"]) == 2 and w.garments["bottom"] == ()
@@ -214,6 +215,7 @@ def test_what_needs_one_garment_is_refused():
         dataclasses.replace(CONFIG, adversarial=True)
 
 
+@pytest.mark.release
 def test_differences_are_those_along_edges():
     wardrobe = make_wardrobe([TIGHT, LOOSE], ("top",))
     *_, tables = prepare_garments(MODEL, wardrobe)

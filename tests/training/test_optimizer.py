@@ -95,6 +95,7 @@ def first_step(gradient_scale=1.0, **rates):
     return [np.asarray(u) for u in updates], state
 
 
+@pytest.mark.release
 def test_kernels_use_muon_and_other_parameters_use_adam():
     (kernel, last, gain), _ = first_step(muon_learning_rate=0.02)
     values = spectrum(kernel.reshape(-1, 8))

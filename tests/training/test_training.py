@@ -500,6 +500,7 @@ def test_gan_monitor_resumes_its_running_means():
     assert got == want
 
 
+@pytest.mark.release
 def test_paper_family_targets_start_at_the_skin(body, rest):
     """At rest, without an offset: from each texel to the cloth that its ray meets."""
     _, surface, tables = prepare_targets(ModelConfig(resolution=32, templates=("bottom",)))

@@ -20,6 +20,7 @@ def bound(request, body, rest):
     return atlas, g, rows, bind(g, atlas=atlas, body=body, rest=rest, valid=rows.valid)
 
 
+@pytest.mark.release
 def test_most_rays_hit_and_fallbacks_are_counted(bound):
     _, g, rows, binding = bound
     assert binding.hit_rate > 0.95
@@ -60,6 +61,7 @@ def test_offset_map_of_a_garment_reproduces_the_garment(bound, body):
     assert np.median(error) < 0.005
 
 
+@pytest.mark.release
 def test_smaller_garment_reuses_programs_and_binds_alike(bound, body, rest):
     atlas, g, rows, binding = bound
     before = closest_points._cache_size()

@@ -28,6 +28,7 @@ def seen(body):
     return one
 
 
+@pytest.mark.release
 def test_ease_is_seen_as_distance_and_area(seen):
     tight, loose = (seen(tailor("tee", ease=e)) for e in (0.05, 0.25))
     both = (tight["covered"] > 0) & (loose["covered"] > 0)
@@ -49,6 +50,7 @@ def test_flare_is_seen_on_the_chart_of_skirts(seen):
     assert (narrow["covered"][:24] == 0).all(), "a skirt has no sleeves"
 
 
+@pytest.mark.release
 def test_borders_are_seen(seen):
     border = seen(tailor("shirt"))["distance to the border"]
     covered = seen(tailor("shirt"))["covered"] > 0
@@ -57,6 +59,7 @@ def test_borders_are_seen(seen):
     assert 0.2 < border[covered].mean() < 0.9
 
 
+@pytest.mark.release
 def test_cotton_is_zero_and_other_fabrics_are_not(seen):
     names = ("bending", "stretch", "density", "friction")
     plain, silk = seen(tailor("shirt")), seen(tailor("shirt", fabric="silk"))
@@ -86,6 +89,7 @@ def test_garments_without_borders_and_of_templates_are_described(seen):
         assert seen(template(name))["covered"].sum() > 300
 
 
+@pytest.mark.release
 def test_fabrics_beyond_those_learned_are_seen_as_the_nearest(body):
     """Denim is stiffer and heavier than anything learned; the control: silk is seen as it is."""
     atlas = make_atlas(64, skirt=True)

@@ -64,6 +64,7 @@ def test_the_garment_map_is_zero_where_no_ray_hit(matrices, body, rest):
     assert 1e-3 < np.median(length) < 0.05
 
 
+@pytest.mark.release
 def test_a_binding_needs_no_mask(matrices, body, rest):
     again = bind(matrices.garment, atlas=matrices.atlas)
     np.testing.assert_array_equal(again.texel, matrices.binding.texel)

@@ -50,6 +50,7 @@ def test_the_person_fills_the_picture(person, camera, size):
         assert abs(columns.mean() - width / 2) < 0.12 * width
 
 
+@pytest.mark.release
 def test_pictures_do_not_depend_on_where_the_person_goes(person):
     """Fixed cameras stand before the person whatever the direction of the walk."""
     there = turned(person, 2.0)

@@ -41,6 +41,7 @@ def viewer():
     it.close()
 
 
+@pytest.mark.release
 def test_viewer_shows_the_selected_choice(viewer):
     assert viewer.shown.choice == SHORT and viewer.shown.num_frames == 10
     viewer.controls.settings["motion"].value = "balance"
@@ -60,6 +61,7 @@ def test_viewer_shows_the_selected_choice(viewer):
     assert viewer.wait().choice == SHORT
 
 
+@pytest.mark.release
 def test_wait_covers_selections_not_yet_requested(viewer, monkeypatch):
     """Between a tick and the answer to it lies a moment: what was shown then is stale."""
     viewer.wait()
@@ -396,6 +398,7 @@ def page(viewer, tmp_path):
     it.close()
 
 
+@pytest.mark.release
 @pytest.mark.browser
 @pytest.mark.skipif(_BROWSER["BROWSER"] is None, reason="no Chromium installed")
 def test_garment_selected_in_a_browser_appears(viewer, page, tmp_path):

@@ -112,6 +112,7 @@ def test_pattern_is_in_metres_and_does_not_overlap(name):
         assert not all(s[0] * m[1] - s[1] * m[0] > 0 for s, m in sides)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("ease", [0.05, 0.12])
 def test_ease_is_what_the_garment_is_wider_than_the_body(body, ease):
     charts = load_charts()
@@ -124,6 +125,7 @@ def test_ease_is_what_the_garment_is_wider_than_the_body(body, ease):
         assert found == pytest.approx(ease, abs=0.012), name
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("name", every_kind())
 def test_no_garment_crosses_itself_at_rest(name):
     ranges = KINDS[name].ranges
@@ -153,6 +155,7 @@ def test_length_runs_down_to_the_hem_and_flare_widens_it():
     assert hem(0.6) - hem(0.3) == pytest.approx(0.3, abs=0.02)
 
 
+@pytest.mark.release
 def test_sleeves_and_necklines_follow_their_measures():
     def loop(measures, which):
         v, f = arrays(tailor("tee", **measures))
@@ -166,6 +169,7 @@ def test_sleeves_and_necklines_follow_their_measures():
     assert high - deep == pytest.approx(0.08, abs=0.02)
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(
     "name", ["skirt", *(pytest.param(k, marks=pytest.mark.release) for k in ("tee", "shorts"))]
 )

@@ -54,6 +54,7 @@ def test_gusts_increase_the_displacement_of_a_sheet():
     assert up[-1] - steady[-1] > 0.02
 
 
+@pytest.mark.release
 def test_turbulence_is_seeded_and_has_the_requested_strength():
     a, b, c = (
         roll(Air(turbulence=2.0, seed=s), 8, (Stretch(), Bend())).positions[0] for s in (1, 1, 2)
@@ -72,6 +73,7 @@ def test_hurricane_cloth_is_finite_and_not_much_faster_than_the_wind():
     assert out.finite.all() and out.diagnostics["speed_max"].max() < 330.0
 
 
+@pytest.mark.release
 def test_body_shelters_cloth_on_its_lee_side(body, rest):
     """Wind from behind: the front of a top is sheltered near the skin, its back isn't."""
     scene = prepare_scene(Scene((template("top"),), (Air(wind=(0.0, 0.0, 10.0)),)))

@@ -208,6 +208,7 @@ def test_friction_limits_sliding_of_cloth_on_cloth(friction):
     assert not out[1:].any()
 
 
+@pytest.mark.release
 def test_self_contact_is_within_each_garment_only():
     """A sheet a millimetre above another: as one garment they meet, as two they don't."""
     low, high = square_sheet(6, 0.2), square_sheet(6, 0.2, corner=(0.0, 0.001, 1.5))
@@ -243,6 +244,7 @@ def test_layers_move_each_vertex_by_its_share(held, share):
     assert not np.asarray(free).any()
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("limbs", "meet"), [((1, 0), True), ((3, 0), True), ((3, 1), False)])
 def test_layer_contact_is_active_only_between_adjacent_limbs(limbs, meet):
     """A sleeve by the hip is no layer over the trousers' leg."""

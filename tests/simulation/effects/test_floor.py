@@ -45,6 +45,7 @@ def roll(scene, solver, frames, velocity=(0.0, 0.0, 0.0), height=0.0):
     return np.concatenate([x[None], out])[..., 0]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("solver", [XPBD(32, 4), XPBD(8, 1), Implicit(16, 4)])
 @pytest.mark.parametrize("height", [0.0, -0.7])
 def test_falling_cloth_comes_to_rest_on_the_floor(solver, height):
@@ -70,6 +71,7 @@ def test_sliding_cloth_decelerates_by_coulombs_law(friction):
     np.testing.assert_allclose(way, v * t - 0.5 * friction * 9.81 * t**2, atol=0.01)
 
 
+@pytest.mark.release
 def test_a_floor_out_of_reach_changes_no_bit():
     effects = (Gravity(), Stretch(), Bend())
     without = roll(prepare_scene(Scene((sheet(),), effects)), XPBD(16, 2), 6, height=1.0)
@@ -79,6 +81,7 @@ def test_a_floor_out_of_reach_changes_no_bit():
     np.testing.assert_array_equal(without, far)
 
 
+@pytest.mark.release
 def test_gradients_through_the_landing_are_finite():
     scene = prepare_scene(Scene((sheet(),), (Gravity(), Stretch(), Floor())))
     solver = XPBD(8, 1)

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.spatial import KDTree
 
@@ -24,6 +25,7 @@ def test_rows_are_those_of_each_batch_member():
         np.testing.assert_array_equal(found[:, :, lane], x[index[:, lane], :, lane])
 
 
+@pytest.mark.release
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**31 - 1))
 def test_nearest_of_few_candidates_is_exact(seed):
@@ -51,6 +53,7 @@ def test_nearest_of_few_candidates_is_exact(seed):
     np.testing.assert_allclose(found, gap.min(axis=1), rtol=1e-4)
 
 
+@pytest.mark.release
 def test_three_nearest_middles_hold_the_nearest_triangle_of_the_skin():
     """Points within 3 cm of the body: twelve candidates, of which three are compared exactly."""
     body = load_body()

@@ -36,6 +36,7 @@ def run(scene, solver, x, frames, guide=None):
     return advance(system, state, pose, root, solver=solver, fps=FPS, guide=guide)[1]
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("spacing", [0.05, 0.08, 0.16])
 def test_patches_are_a_partition_of_every_garment(spacing):
     garments = (tailor("tee"), tailor("shorts"))
@@ -84,6 +85,7 @@ def test_what_is_coarse_atlas_a_patch_is_left_alone():
     assert np.abs(np.asarray(out[-1]) - rough).max() < 5e-3
 
 
+@pytest.mark.release
 def test_without_a_target_nothing_changes():
     others = (Gravity(), Stretch(), Bend())
     plain = prepare_scene(Scene((sheet(),), others))

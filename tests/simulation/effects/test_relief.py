@@ -28,6 +28,7 @@ def test_corners_within_reach_of_a_tip_lie_as_high_up_to_a_limit(tip, rise):
     assert (out[away > 0.0165] == 0).all()
 
 
+@pytest.mark.release
 @pytest.mark.parametrize("radius", [0.05, 0.1])
 def test_on_a_sphere_it_is_the_sag_of_a_chord(radius):
     rng = np.random.default_rng(0)
@@ -59,6 +60,7 @@ def test_small_triangles_lie_lower_than_large_ones():
     assert 0 < heights[1] < heights[0] < 0.004
 
 
+@pytest.mark.release
 def test_each_garment_of_a_scene_has_the_relief_of_its_own_triangles():
     coarse, fine = template("dress"), refine_garment(template("bottom"), 0.012)
     plain = dataclasses.replace(fine, coarse_faces=None)

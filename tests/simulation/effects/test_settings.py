@@ -136,6 +136,7 @@ def test_gradient_is_finite_for_a_strain_limit_between_pinned_vertices(solver, b
     assert np.isfinite(np.asarray(slope)).all() and np.abs(np.asarray(slope)).max() > 0.1
 
 
+@pytest.mark.release
 @pytest.mark.parametrize(("depth", "told"), [(0.03, True), (0.1, True), (-0.05, False)])
 def test_layers_far_on_the_wrong_side_are_reported(depth, told):
     """Put right it is from 5 cm only; told of from farther."""
