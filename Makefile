@@ -28,7 +28,7 @@ test: $(VENV)/.ready
 	$(BIN)/python -m pytest
 
 test-release: $(VENV)/.ready
-	$(BIN)/python -m pytest -m release
+	$(BIN)/python -m pytest -m "release and not nightly"
 
 # On this Python the longest tests; on the others the quick ones.
 NIGHTLY_PYTHONS ?= python3.12 python3.13

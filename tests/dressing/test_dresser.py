@@ -343,40 +343,44 @@ print(len(jax.devices()), "devices")
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("fps", [30.0, pytest.param(120.0, marks=pytest.mark.nightly)])
+@pytest.mark.parametrize("fps", [30.0, 120.0])
 def test_clip_starts_without_a_jump(fps):
-    """Cloth accelerates in the first frames as in those after, however many there are a second."""
+    """Clips cut out of a walk begin as the walk goes on, however many frames there are a second."""
     walk = load_motion("walk", fps=fps)
-    clip = dataclasses.replace(walk, rotations=walk.rotations[15:47], root=walk.root[15:47])
-    dresser = make_dresser(
-        ["bottom"], inference=Inference(weights="nano", strain_iterations=0, collisions=False)
-    )
-    worn = jax.jit(clothe, static_argnames="fps")(dresser, clip.rotations, clip.root, fps=fps)
+    inference = Inference(weights="nano", strain_iterations=0, collisions=False)
+    dresser = make_dresser(["trousers"], inference=inference)
+    run = jax.jit(clothe, static_argnames="fps")
+    whole = np.asarray(run(dresser, walk.rotations, walk.root, fps=fps)["trousers"])
+    frames = int(0.4 * fps)
 
-    def jumps(x):
-        second = np.linalg.norm(np.diff(np.asarray(x), n=2, axis=0), axis=2)
-        return np.quantile(second, 0.99, axis=1)
+    def begin(still):
+        """Error to the whole walk, and largest acceleration over its own; means of eight starts."""
+        errors, jumps = [], []
+        for k in range(1, 9):
+            start = int(0.3 * k * fps)
+            q, p, true = (x[start : start + frames] for x in (walk.rotations, walk.root, whole))
+            if still:
+                # The control: somebody who stood still until then is thrown into motion.
+                q, p = (jnp.concatenate([x[:1], x]) for x in (q, p))
+            cloth = np.asarray(run(dresser, q, p, fps=fps)["trousers"])[int(still) :]
+            errors.append(np.sqrt(np.mean(np.sum((cloth - true) ** 2, axis=-1))))
+            second = [np.linalg.norm(np.diff(x[:6], n=2, axis=0), axis=2) for x in (cloth, true)]
+            now, usual = (np.quantile(x, 0.99, axis=1).max() for x in second)
+            jumps.append(now / usual)
+        return np.mean(errors), np.mean(jumps)
 
-    now = jumps(worn["bottom"])
-    assert now[:4].max() < 2.0 * now[4:].max()
-    again = dress(
-        clip,
-        ["bottom"],
-        method="network",
-        inference=Inference(weights="nano", strain_iterations=0, collisions=False),
-        fps=fps,
-        include_body=False,
-    )
-    np.testing.assert_allclose(again.garments[0].positions, worn["bottom"], atol=1e-5)
+    error, jump = begin(still=False)
+    thrown_error, thrown = begin(still=True)
+    assert jump < 1.2
+    assert error < 0.8 * thrown_error
     if fps > 100:
-        # The control: somebody who stood still until then is thrown into motion.
-        stream = init_stream(dresser, clip.rotations[0], clip.root[0])
-        step = jax.jit(clothe_step, static_argnames="fps")
-        thrown = []
-        for q, p in zip(clip.rotations[:8], clip.root[:8]):
-            stream, cloth = step(dresser, stream, q, p, fps=fps)
-            thrown.append(cloth["bottom"])
-        assert jumps(thrown)[:4].max() > 5.0 * now[4:].max()
+        assert thrown > 2.0
+    clip = dataclasses.replace(walk, rotations=walk.rotations[15:47], root=walk.root[15:47])
+    worn = run(dresser, clip.rotations, clip.root, fps=fps)["trousers"]
+    again = dress(
+        clip, ["trousers"], method="network", inference=inference, fps=fps, include_body=False
+    )
+    np.testing.assert_allclose(again.garments[0].positions, worn, atol=1e-5)
 
 
 @pytest.mark.release

@@ -134,11 +134,11 @@ def test_with_upper_body_keeps_the_legs_and_plays_back_and_forth():
         with_upper_body(still, walk, punch)
 
 
-def test_extrapolated_history_has_constant_velocity():
+def test_extrapolated_history_goes_on_and_calms_down():
     clip = load_motion("walk", fps=60.0)
-    q, p = extrapolate_history(clip.rotations, clip.root, 5)
+    q, p = extrapolate_history(clip.rotations, clip.root, 5, 60.0)
     assert q.shape == (5, 31, 4) and p.shape == (5, 3)
-    # At one speed from the oldest of them to the clip's second pose.
+    # The root at one speed from the oldest of them to the clip's second pose.
     way = np.concatenate([p, clip.root[:2]])
     np.testing.assert_allclose(np.diff(way, n=2, axis=0), 0.0, atol=1e-6)
     assert np.abs(np.diff(way, axis=0)).max() > 0.01
@@ -146,11 +146,36 @@ def test_extrapolated_history_has_constant_velocity():
         Rotation.from_quat(np.asarray(x), scalar_first=True) for x in (*q, *clip.rotations[:2])
     ]
     steps = [(a.inv() * b).as_matrix() for a, b in itertools.pairwise(turns)]
-    np.testing.assert_allclose(steps, [steps[-1]] * 6, atol=1e-5)
+    np.testing.assert_allclose(steps[-2], steps[-1], atol=1e-5)
     assert np.abs(steps[-1] - np.eye(3)).max() > 0.01
-    one = extrapolate_history(clip.rotations[:1], clip.root[:1], 3)
+    turned = Rotation.from_matrix(np.reshape(steps, (-1, 3, 3))).magnitude().reshape(6, -1)
+    swings = turned[-1] > 0.01
+    decay = np.exp(-((np.arange(4, -1, -1) / 9.0) ** 2))[:, None]
+    np.testing.assert_allclose(
+        turned[:-1, swings] / turned[-1, swings], decay + 0.0 * turned[:-1, swings], rtol=2e-2
+    )
+    one = extrapolate_history(clip.rotations[:1], clip.root[:1], 3, 60.0)
     np.testing.assert_allclose(one[1], np.tile(clip.root[:1], (3, 1)), atol=1e-6)
     assert np.abs(np.abs(np.sum(np.asarray(one[0] * clip.rotations[:1]), axis=-1)) - 1).max() < 1e-5
-    assert extrapolate_history(clip.rotations, clip.root, 0)[0].shape == (0, 31, 4)
-    spoiled = extrapolate_history(clip.rotations.at[1].set(np.nan), clip.root, 5)
+    assert extrapolate_history(clip.rotations, clip.root, 0, 60.0)[0].shape == (0, 31, 4)
+    spoiled = extrapolate_history(clip.rotations.at[1].set(np.nan), clip.root, 5, 60.0)
     assert np.isfinite(np.asarray(spoiled[0])).all() and np.isfinite(np.asarray(spoiled[1])).all()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_history_is_the_same_turn_at_every_rate(sign):
+    """A joint at 4 rad/s came from sqrt(pi) / 2 * 0.15 s of turning, whatever the frame rate."""
+    turned = {}
+    for fps in (30.0, 120.0):
+        angle = 0.5 + 4.0 * np.arange(2) / fps
+        q = np.stack([np.cos(angle / 2), np.sin(angle / 2), 0 * angle, 0 * angle], -1)[:, None]
+        q[1] *= sign  # the same pose
+        back = extrapolate_history(
+            q.astype(np.float32), np.zeros((2, 3), np.float32), int(fps), fps
+        )
+        was = Rotation.from_quat(np.asarray(back[0][:, 0]), scalar_first=True).as_rotvec()[:, 0]
+        turned[fps] = 0.5 - was[:: -int(fps // 30)]
+        assert (np.diff(was) >= 0.0).all() and np.diff(was)[-1] > 0.0
+        assert abs(turned[fps].max() - 4.0 * 0.1329) < 4.0 / fps
+    whole, fine = turned[30.0], turned[120.0]
+    assert np.abs(whole - fine).max() < 4.0 / 30.0

@@ -152,7 +152,7 @@ def clothe(
 ) -> Clothed:
     """Computes garments in successive frames; pure, for `jax.jit`, `jax.vmap`, `jax.grad`.
 
-    Poses before frame 0 are extrapolated at constant velocity, see `extrapolate_history`.
+    Poses before frame 0 are extrapolated, see `extrapolate_history`.
 
     Outside of such transformations the clip is padded to one of a few lengths, so that clips of
     any lengths share a few compiled programs. Within your own `jax.jit` each length is a program:
@@ -244,7 +244,7 @@ def _clothe(
     place = _on_ground(root[0])
     root = root - place[None]
     length = dresser.history_length(fps)
-    history = extrapolate_history(rotations, root, length)
+    history = extrapolate_history(rotations, root, length, fps)
     joints = (jnp.concatenate(pair) for pair in zip(history, (rotations, root), strict=True))
     transforms = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*joints)
     usable = jnp.concatenate([jnp.ones((length,), bool), usable])
@@ -298,7 +298,7 @@ def init_stream(
     if dresser.predictor is None:
         return stream
     texels = dresser.predictor.texel_points
-    history = extrapolate_history(rotations, root, length)
+    history = extrapolate_history(rotations, root, length, fps)
     r, t = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*history)
     points = jax.vmap(lambda a, b: skin_points(texels.rest, texels.weights, a, b)[0])(r, t)
     scene = dresser.guided
