@@ -379,3 +379,14 @@ def test_budget_and_error_limit_together_are_refused_before_reading(capsys):
     words = ["--budget-ms", "5", "--max-error-mm", "20", "--character", "none.glb"]
     assert main(["dress", "walk", "--wear", "top", *words]) == 2
     assert "either a time" in capsys.readouterr().err
+
+
+def test_a_file_that_cannot_be_read_hides_no_other(tmp_path, capsys):
+    gone = [str(tmp_path / name) for name in ("gone.bvh", "lost.bvh")]
+    assert main(["inspect", gone[0], "walk", "--json"]) == 2
+    said = capsys.readouterr()
+    (found,) = json.loads(said.out)
+    assert found["path"] == "walk" and "gone.bvh" in said.err
+    assert main(["inspect", *gone]) == 2
+    said = "".join(capsys.readouterr().err.split())
+    assert "gone.bvh" in said and "lost.bvh" in said

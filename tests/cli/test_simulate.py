@@ -50,6 +50,7 @@ from physxnet_jax.simulation.effects import (
     LayerContact,
     Membrane,
     Pin,
+    Seam,
     Stretch,
 )
 
@@ -93,6 +94,10 @@ def test_only_frames_can_override_a_scene_file(tmp_path, capsys):
     with np.load(out) as data:
         assert data["bottom_positions"].shape == plain.shape
         assert np.abs(data["bottom_positions"] - plain).max() > 1e-3, "refined"
+    words[words.index("--refine") : words.index("-o")] = ["--substeps", "3"]
+    assert main(words) == 0
+    with np.load(out) as data:
+        assert np.abs(data["bottom_positions"] - plain).max() > 1e-5, "other steps"
     assert main(["simulate", str(scene), "--frames", "0"]) == 2
     assert "at least one" in capsys.readouterr().err
     for words in (["--wear", "dress"], ["--fps", "25"], ["--wind", "0", "0", "1"]):
@@ -120,6 +125,8 @@ def test_scene_files_define_garments_effects_and_motion(tmp_path):
     path.write_text('motion = "walk"\ngarments = ["bottom"]\n[effects.membrane]\n[effects.floor]\n')
     kinds = {type(e) for e in load_scene(path).scene.effects}
     assert {Membrane, Floor} <= kinds and Stretch not in kinds, "one law of stretching"
+    path.write_text('motion = "walk"\n[effects.seam]\nstitches = [[0, 5], [1, 6]]\n')
+    assert Seam(stitches=((0, 5), (1, 6))) in load_scene(path).scene.effects
     both = make_scene("walk", ["top", "bottom"])
     assert [g.name for g in both.scene.garments] == ["bottom", "top"], "the innermost first"
     assert LayerContact() in both.scene.effects
@@ -264,6 +271,10 @@ def test_motions_are_simulated_at_the_requested_rate():
             "hops is 2.5, expected a whole number",
         ),
         ('motion = "walk"\n[effects.body_contact]\nhops = true', "hops is True, expected a whole"),
+        ('motion = "walk"\n[effects.seam]\nstitches = [0, 5]', "stitches is a list of lists"),
+        ('motion = "walk"\n[effects.seam]\nstitches = [[0, 5, 6]]', "a pair of vertices"),
+        ('motion = "walk"\n[effects.seam]\nstitches = [[0, 5.5]]', "a whole number"),
+        ('motion = "walk"\n[effects.air]\nwind = [[0, 0, 4]]', "wind is not a list of lists"),
         ('motion = "walk"\n[shape]\nself = 1', "Unknown shape parameter"),
         ('motion = "walk"\naccuracy = "best"', "draft, standard, fine"),
         ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = "tin"', "cotton"),
@@ -493,3 +504,14 @@ def test_guided_takes_fabric_wind_and_substeps_alone(tmp_path, capsys):
         assert (says or "") in capsys.readouterr().err
     assert main([*words, "--strain-iterations", "2", "-o", str(tmp_path / "no.npz")]) == 2
     assert "--method guided has none" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.release
+def test_accuracy_of_a_scene_file_concerns_no_other_engine(tmp_path, capsys):
+    scene = tmp_path / "scene.toml"
+    few = 'motion = "balance"\naccuracy = "draft"\ngarments = ["bottom"]\nstandard = false\n'
+    scene.write_text(f"{few}[effects.gravity]\n")
+    words = ["simulate", str(scene), "--engine", "bdf2", "--frames", "1", "--quiet"]
+    assert main([*words, "-o", str(tmp_path / "a.npz")]) == 0
+    assert main([*words, "--accuracy", "fine"]) == 2
+    assert "xpbd only" in " ".join(capsys.readouterr().err.split())

@@ -31,6 +31,15 @@ def test_a_table_is_written_for_a_folder_of_motions(tmp_path):
         write_protocol(tmp_path)
 
 
+def test_a_few_files_have_a_test_action_too(tmp_path):
+    walk = load_motion("walk")
+    for name, splits in (("a", ["train"]), ("b", ["train", "test"])):
+        save_motion(tmp_path / f"{name}.npz", walk[:20])
+        (tmp_path / "ACTIONS.csv").unlink(missing_ok=True)
+        write_protocol(tmp_path)
+        assert [a.split for a in read_protocol(tmp_path)] == splits
+
+
 def test_a_folder_without_motions_is_refused(tmp_path):
     with pytest.raises(MotionError, match="no motion that can be read"):
         write_protocol(tmp_path)

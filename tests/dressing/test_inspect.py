@@ -61,7 +61,7 @@ def test_all_faults_are_reported_and_repaired(tmp_path, trousers):
     for word in ("coincide", "twice", "cloth tears"):
         assert word in told
     out = tmp_path / "well.obj"
-    assert found.command == f"physxnet fit {path} -o {tmp_path / 'sick_fitted.obj'}"
+    assert found.command == f"physxnet fit {path} -o sick_fitted.obj"
     done, after = fit_garment(path, out)
     assert after.problems == () and after.unit == "m" and after.health.components == 1
     assert any("welded" in d for d in done) and any("flipped" in d for d in done)
@@ -155,7 +155,8 @@ def test_fitting_applies_the_requested_edge_lengths(tmp_path, trousers):
 
 
 @pytest.mark.release
-def test_inspect_and_fit_commands_print_the_report(tmp_path, trousers, capsys):
+def test_inspect_and_fit_commands_print_the_report(tmp_path, trousers, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     good, bad = (
         saved(tmp_path, "good.obj", *trousers),
         saved(tmp_path, "bad.obj", trousers[0], trousers[1][:, ::-1]),

@@ -14,7 +14,9 @@ from physxnet_jax.geometry import (
     fast_argmin,
     make_mesh,
     nearby_faces,
+    nearest_distinct,
     nearest_index,
+    nearest_indices,
     signed_distance,
 )
 
@@ -182,3 +184,27 @@ def test_signs_are_correct_near_a_sharp_edge():
     clear = np.abs(height).min(axis=1) > 1e-3
     ours = np.asarray(signed_distance(mesh, jnp.asarray(points, jnp.float32)))
     assert ((ours < 0) == (height < 0).all(axis=1))[clear].all()
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_nearest_distinct_are_the_first_of_a_sort_without_repetitions(count):
+    rng = np.random.default_rng(0)
+    worth = rng.permutation(40).astype(np.float32)
+    labels = rng.integers(0, 40, (9, 5, 2))
+    found = nearest_distinct(jnp.asarray(worth[labels]), jnp.asarray(labels), count)
+    assert found.shape == (count, 5, 2)
+    for i, j in np.ndindex(5, 2):
+        own = np.unique(labels[:, i, j])
+        np.testing.assert_array_equal(found[:, i, j], own[np.argsort(worth[own])][:count])
+    # Fewer labels than are wanted: the first row's fills up.
+    few = nearest_distinct(jnp.zeros((4, 1)), jnp.full((4, 1), 7), 3)
+    np.testing.assert_array_equal(few[:, 0], [7, 7, 7])
+
+
+def test_several_searches_in_one_pass_are_the_searches():
+    rng = np.random.default_rng(1)
+    a, b = (jnp.asarray(rng.random((17, 6)), jnp.float32) for _ in range(2))
+    for both, one in zip(nearest_indices(a, b), (nearest_index(a), nearest_index(b)), strict=True):
+        np.testing.assert_array_equal(both, one)
+    mapped = jax.vmap(nearest_indices)(a[None], b[None])
+    np.testing.assert_array_equal(mapped[1][0], nearest_index(b))

@@ -14,9 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from physxnet_jax import inspect_motion
 from physxnet_jax.cli import main
+from physxnet_jax.cli._dress import _job
+from physxnet_jax.cli._options import BodyOptions, MotionSource, Outfit
 from physxnet_jax.errors import MotionError
 from physxnet_jax.motion import (
     JOINT_MAPS,
+    declared_too_fast,
     load_motion,
     procedural_clip,
     read_bvh,
@@ -211,3 +214,17 @@ def test_motion_problems_set_the_exit_code(walk, tmp_path, capsys):
 def test_motion_options_are_refused_for_a_garment(capsys):
     assert main(["inspect", "shirt.obj", "--source-fps", "60"]) == 2
     assert "--source-fps is for motions" in " ".join(capsys.readouterr().err.split())
+
+
+def test_rates_that_cmu_declares_twice_too_high_are_noted(tmp_path):
+    """Dressing says it as inspecting does; not where a rate is given."""
+    for name in ("060_10.bvh", "61_01.amc", "a/60_03.bvh"):
+        assert "pass --source-fps 60" in (declared_too_fast(name, 120.0) or "")
+    for name, fps in (("060_10.bvh", 60.0), ("06_10.bvh", 120.0), ("60.bvh", 120.0)):
+        assert declared_too_fast(name, fps) is None
+    save_motion(tmp_path / "60_01.npz", load_motion("walk", fps=120.0))
+    for rate, noted in ((None, 1), (60.0, 0)):
+        source = MotionSource(source_fps=rate)
+        word = str(tmp_path / "60_01.npz")
+        job = _job(word, source, Outfit(), BodyOptions(), {"method": "network"}, lambda *_: None)
+        assert len(job.notes) == noted

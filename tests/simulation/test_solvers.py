@@ -13,6 +13,7 @@ from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import (
     PRESETS,
     XPBD,
+    Effect,
     Implicit,
     Scene,
     State,
@@ -24,7 +25,9 @@ from physxnet_jax.simulation import (
     settle_on_static_body,
     simulate,
 )
+from physxnet_jax.simulation._effect import Prepared
 from physxnet_jax.simulation.effects import Bend, Dihedral, Gravity, Membrane, Pin, Stretch
+from physxnet_jax.typing import pytree
 
 SOFT = Fabric(stretch=300.0, bend=1e-5, warp=300.0, weft=300.0, shear=50.0)
 
@@ -186,3 +189,24 @@ def test_energies_are_optional_and_conserved():
     assert np.ptp(total) < 0.01 * d["energy_kinetic"].max()
     plain = settle_on_static_body(scene, 1, solver=XPBD(4, 1)).diagnostics
     assert not any(k.startswith("energy") for k in plain)
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
+class _Stored(Prepared):
+    elastic = True
+
+    def energy(self, displacement, context):
+        return jnp.sum(displacement**2, axis=(0, 1))
+
+
+@dataclasses.dataclass(frozen=True)
+class _Storing(Effect):
+    def prepare(self, assembly, inverse_mass):
+        return _Stored()
+
+
+def test_energies_without_what_a_solver_needs_of_them_are_refused():
+    scene = swinging((_Storing(),))
+    with pytest.raises(SimulationError, match=r"Stored stores energy .* `hessian`"):
+        make_system(scene, Implicit(4, 2))

@@ -26,9 +26,9 @@ from ..dressing import (
 from ..errors import FormatError, OutOfMemoryError, PhysXNetError
 from ..files import check_writable
 from ..frames import IN_MEMORY, scratch_folder
-from ..io import check_output, write_clip
+from ..io import GltfFile, check_output, write_clip
 from ..models import read_card
-from ..motion import Motion, load_motion
+from ..motion import Motion, declared_too_fast, load_motion
 from ..viewer import check_preview, render_preview
 from ._calibrate import choose
 from ._clock import lap
@@ -148,6 +148,10 @@ def run_demo(command: Demo, console: Console) -> int:
     return run_dress(job, console, still=command.out / "demo.png")
 
 
+# Options that overrule a scene file.
+_OVER_SCENE = ("--accuracy", "--engine", "--refine", "--substeps")
+
+
 def is_scene_file(word: str) -> bool:
     """Whether the argument names a scene file instead of a motion."""
     return pathlib.Path(word).suffix.lower() == ".toml"
@@ -161,7 +165,7 @@ def scene_file(command: Simulate | Effects) -> Any:
     """
     source = dataclasses.replace(command.source, frames=MotionSource().frames)
     given = [*changed(source), *changed(command.outfit), *changed(command.simulation)]
-    given = [g for g in given if g not in ("--accuracy", "--engine", "--refine")]
+    given = [g for g in given if g not in _OVER_SCENE]
     if isinstance(command, Simulate):
         given += changed(command.person)
     if given:
@@ -175,7 +179,9 @@ def scene_file(command: Simulate | Effects) -> Any:
 def _scene_job(command: Simulate) -> _Job:
     found = scene_file(command)
     options = command.simulation
-    simulation = dataclasses.replace(options, accuracy=options.accuracy or found.accuracy).build()
+    if options.engine == "xpbd":
+        options = dataclasses.replace(options, accuracy=options.accuracy or found.accuracy)
+    simulation = options.build()
     if options.engine in EXTERNAL_ENGINES:
         if found.lists_effects:
             raise FormatError(
@@ -242,9 +248,19 @@ def _job(
         frames=source.frames,
         fps=source.fps,
         start=0.0 if custom is not None else source.start,
+        notes=() if person.animated_body else _slower(word, source),
         stages=(begun, loaded),
         **(defaults | options),
     )
+
+
+def _slower(word: str, source: MotionSource) -> tuple[str, ...]:
+    """A note where the file's rate is known to be wrong, and isn't given."""
+    if source.source_fps is not None or declared_too_fast(word, 120.0) is None:
+        return ()
+    own = load_motion(word, skeleton=source.skeleton, up=source.up, joint_map=source.joint_map).fps
+    note = declared_too_fast(word, own)
+    return () if note is None else (f"{word}: {note}",)
 
 
 def _run(
@@ -379,6 +395,9 @@ def _lost(job: _Job, output: Output) -> tuple[str, ...]:
     if out is None or not isinstance(job.motion, Character) or not output.body:
         return ()
     if _keeps_rig(job.motion, output):
+        meshes = GltfFile(job.motion.rig.path).document.meshes if job.motion.rig else []
+        if not any(part.targets for mesh in meshes for part in mesh.primitives):
+            return ()
         return ("the character's expressions (morph targets) are kept, but not animated",)
     if job.motion.rig is not None:
         return (

@@ -18,7 +18,7 @@ from ..dressing import (
     inspect_garment,
     is_character,
 )
-from ..errors import MeshError
+from ..errors import MeshError, PhysXNetError
 from ..garment import Opening, template
 from ..io import GltfFile, write_obj
 from ..motion import CLIPS, MotionInspection, inspect_motion, split_animation
@@ -43,19 +43,31 @@ def inspect(command: Inspect, console: Console) -> int:
     }
     given = [f"--{k.replace('_', '-')}" for k, v in motion_options.items() if v is not None]
     found: list[_Found] = []
+    failed: list[PhysXNetError] = []
     for file in command.files:
-        if command.motion or _is_motion(file):
-            found.append(inspect_motion(file, **motion_options))
-        elif given:
-            raise MeshError(f"{given[0]} is for motions; {file} has a mesh. Inspect it separately.")
-        elif is_character(file):
-            found.append(inspect_character(file))
-        else:
-            found.append(inspect_garment(file))
+        try:
+            if command.motion or _is_motion(file):
+                found.append(inspect_motion(file, **motion_options))
+            elif given:
+                raise MeshError(
+                    f"{given[0]} is for motions; {file} has a mesh. Inspect it separately."
+                )
+            elif is_character(file):
+                found.append(inspect_character(file))
+            else:
+                found.append(inspect_garment(file))
+        except PhysXNetError as error:
+            # The others are inspected all the same.
+            failed.append(error)
+            continue
         if not command.terminal.json:
             _show(found[-1], console)
-    if command.terminal.json:
+    if command.terminal.json and (found or not failed):
         print_json([_to_json(f) for f in found])
+    if len(failed) == 1:
+        raise failed[0]
+    if failed:
+        raise PhysXNetError("\n".join(str(error) for error in failed))
     return int(any(f.problems for f in found))
 
 

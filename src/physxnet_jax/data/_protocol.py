@@ -120,7 +120,8 @@ def write_protocol(
 ) -> tuple[pathlib.Path, tuple[str, ...]]:
     """Writes ``ACTIONS.csv`` for a folder of motion files, to be edited.
 
-    Every file becomes an action over its whole length; every fifth is a test action.
+    Every file becomes an action over its whole length; every fifth is a test action, of fewer
+    than five the last.
 
     Args:
         folder: The folder; files in folders below it count too.
@@ -155,6 +156,8 @@ def write_protocol(
             progress("motions", k + 1, len(files))
     if not rows:
         raise MotionError.at(folder, None, "no motion that can be read", "Put motion files there")
+    if 1 < len(rows) < _TEST_EVERY:
+        rows[-1] = ("test", *rows[-1][1:])
     with atomic_write(table) as part, part.open("w", newline="", encoding="utf-8") as out:
         lines = csv.writer(out)
         lines.writerow(_COLUMNS)

@@ -402,6 +402,6 @@ def _template_distances(vertices: np.ndarray) -> dict[Template, float]:
 
 
 def _command(path: pathlib.Path, options: list[str]) -> str:
-    out = path.with_name(f"{mesh_name(path)}_fitted.obj")
-    words = ["physxnet", "fit", shlex.quote(str(path)), *options, "-o", shlex.quote(str(out))]
+    out = f"{mesh_name(path)}_fitted.obj"
+    words = ["physxnet", "fit", shlex.quote(str(path)), *options, "-o", shlex.quote(out)]
     return " ".join(words)

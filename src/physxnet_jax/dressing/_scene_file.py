@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import pathlib
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
@@ -235,7 +236,7 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         [effects.air]              # in addition to the standard ones; alone with standard = false
         wind = [0.0, 0.0, 4.0]
 
-    docs/scene-files.md lists every key with its unit and default.
+    docs/reference/scene-files.md lists every key with its unit and default.
 
     Raises:
         FormatError: The file isn't TOML, or has an unknown key, effect or setting.
@@ -369,15 +370,17 @@ def _parse_effects(path: pathlib.Path, table: dict[str, Any]) -> list[Effect]:
     return out
 
 
-def _convert_setting(field: dataclasses.Field, value: Any) -> Any:
+def _convert_setting(field: dataclasses.Field, value: Any, within: bool = False) -> Any:
     if isinstance(value, list):
-        if any(isinstance(v, list) for v in value):
-            raise TypeError(f"{field.name} is a list of lists")
-        return tuple(_convert_setting(field, v) for v in value)
+        nested = str(field.type).startswith("tuple[tuple[")
+        if any(isinstance(v, list) != (nested and not within) for v in value):
+            raise TypeError(f"{field.name} is {'' if nested else 'not '}a list of lists")
+        return tuple(_convert_setting(field, v, within=True) for v in value)
     wants_float = field.type is float or "float" in str(field.type)
     if wants_float and (isinstance(value, bool) or not isinstance(value, int | float)):
         raise TypeError(f"{field.name} is {value!r}, expected a number")
-    if field.type is int and (isinstance(value, bool) or not isinstance(value, int)):
+    wants_int = field.type is int or re.search(r"\bint\b", str(field.type)) is not None
+    if wants_int and (isinstance(value, bool) or not isinstance(value, int)):
         raise TypeError(f"{field.name} is {value!r}, expected a whole number")
     if field.type is bool and not isinstance(value, bool):
         raise TypeError(f"{field.name} is {value!r}, expected true or false")

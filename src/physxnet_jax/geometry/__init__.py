@@ -8,7 +8,9 @@ from ._closest import (
     closest_barycentric as closest_barycentric,
     closest_points as closest_points,
     fast_argmin as fast_argmin,
+    nearest_distinct as nearest_distinct,
     nearest_index as nearest_index,
+    nearest_indices as nearest_indices,
     signed_distance as signed_distance,
 )
 from ._edge_constraints import (

@@ -185,18 +185,10 @@ def _nearest_middles(
     count: int,
 ) -> Int[Array, "points count"]:
     """Those of each point's candidates whose middles are nearest."""
-    # Arithmetic that is fused with gathers or with the search isn't vectorised.
-    apart = jax.lax.optimization_barrier
     order = candidates.T
-    middles = apart(jnp.sum(corners.reshape(-1, 3, 3), axis=1) / 3.0)
-    there = apart([m[order] for m in middles.T])
-    gap = sum((m - q[None]) ** 2 for m, q in zip(there, p, strict=True))
-    chosen = []
-    for _ in range(count):
-        chosen.append(jnp.take_along_axis(order, nearest_index(apart(gap))[None], axis=0))
-        # A list may name a triangle twice.
-        gap = jnp.where(order == chosen[-1], jnp.inf, gap)
-    return jnp.concatenate(chosen).T
+    middles = jax.lax.optimization_barrier(jnp.sum(corners.reshape(-1, 3, 3), axis=1) / 3.0)
+    x, y, z = (m[order] - q[None] for m, q in zip(middles.T, p, strict=True))
+    return nearest_distinct(x * x + y * y + z * z, order, count).T
 
 
 def _nearest(
@@ -237,10 +229,61 @@ def nearest_index(squared: Float[Array, " rows *others"]) -> Int[Array, " *other
     Args:
         squared: Values of at least 0, as squared distances.
     """
+    return nearest_indices(squared)[0]
+
+
+def nearest_indices(
+    *squared: Float[Array, " rows *others"],
+) -> tuple[Int[Array, " *others"], ...]:
+    """`nearest_index` of several arrays in one pass, into which their computation is fused."""
+    keys, masks = zip(*(_indexed(x) for x in squared), strict=True)
+    start = (jnp.iinfo(jnp.int32).max,) * len(keys)
+    lower = functools.partial(jax.tree.map, jnp.minimum)
+    smallest = jax.lax.reduce(keys, tuple(map(jnp.int32, start)), lower, (0,))
+    rows = squared[0].shape[0]
+    return tuple(jnp.minimum(x & m, rows - 1) for x, m in zip(smallest, masks, strict=True))
+
+
+def nearest_distinct(
+    squared: Float[Array, " rows *others"], labels: Int[Array, " rows *others"], count: int
+) -> Int[Array, " count *others"]:
+    """Labels of the smallest values along the first axis, the smallest first, each label once.
+
+    One pass, into which the values' own computation is fused: twice as fast as a search that
+    is repeated without what was found. As precise as `nearest_index`. Where there are fewer
+    labels, the first row's is repeated.
+
+    Args:
+        squared: Values of at least 0, as squared distances; equal where labels are.
+        labels: What is named, at least 0.
+        count: Number of labels.
+    """
+    last, none = jnp.iinfo(jnp.int32).max, -1
+
+    def merged(kept: tuple[Array, ...], more: tuple[Array, ...]) -> tuple[Array, ...]:
+        keys, names = list(kept[:count]), list(kept[count:])
+        for key, name in zip(more[:count], more[count:], strict=True):
+            known = functools.reduce(jnp.logical_or, (name == other for other in names))
+            key = jnp.where(known, last, key)
+            for k in range(count):
+                less = key < keys[k]
+                keys[k], key = jnp.where(less, key, keys[k]), jnp.where(less, keys[k], key)
+                names[k], name = jnp.where(less, name, names[k]), jnp.where(less, names[k], name)
+        return (*keys, *names)
+
+    keys, _ = _indexed(squared)
+    labels = labels.astype(jnp.int32)
+    empty = (jnp.full_like(keys, last),) * (count - 1), (jnp.full_like(keys, none),) * (count - 1)
+    start = (jnp.int32(last),) * count + (jnp.int32(none),) * count
+    found = jax.lax.reduce((keys, *empty[0], labels, *empty[1]), start, merged, (0,))[count:]
+    return jnp.stack([jnp.where(x < 0, labels[0], x) for x in found])
+
+
+def _indexed(squared: Float[Array, " rows *others"]) -> tuple[Int[Array, " rows *others"], int]:
+    """Values as integers of the same order that end in the index of their row, and its bits."""
     mask = (1 << max(squared.shape[0] - 1, 1).bit_length()) - 1
     bits = jax.lax.bitcast_convert_type(squared.astype(jnp.float32), jnp.int32)
-    index = jax.lax.broadcasted_iota(jnp.int32, squared.shape, 0)
-    return jnp.minimum(jnp.min((bits & ~mask) | index, axis=0) & mask, squared.shape[0] - 1)
+    return (bits & ~mask) | jax.lax.broadcasted_iota(jnp.int32, squared.shape, 0), mask
 
 
 def signed_distance(

@@ -2,7 +2,7 @@
 
 from ._asf_amc import read_amc as read_amc
 from ._bvh import read_bvh as read_bvh
-from ._faults import sudden_turns as sudden_turns
+from ._faults import declared_too_fast as declared_too_fast, sudden_turns as sudden_turns
 from ._fit_motion import fit_motion as fit_motion
 from ._gltf import (
     read_gltf as read_gltf,

@@ -1,5 +1,8 @@
 """Detection of motion faults that affect the clothes."""
 
+import pathlib
+import re
+
 import numpy as np
 
 from ..body import Body
@@ -7,6 +10,8 @@ from ._motion import Motion
 
 # Largest plausible turn of a limb from frame to frame [degrees], at 30 fps or more.
 _MAX_TURN = 60.0
+# CMU subjects whose converted files declare 120 frames per second and have 60.
+_SLOW_SUBJECTS = ("60", "61")
 _JOINTS = ("Hips", "Spine", "UpLeg", "Leg", "Arm", "ForeArm")
 
 
@@ -43,4 +48,20 @@ def sudden_turns(body: Body, motion: Motion) -> str | None:
         f"{motion.name or 'the motion'}: {names[rows[which]]} turns by {degrees[frame, which]:.0f}"
         f" degrees from frame {frame} to {frame + 1}{others}: no limb turns that"
         " fast, and the clothes will be flung about there."
+    )
+
+
+def declared_too_fast(path: str | pathlib.Path, fps: float) -> str | None:
+    """A note on files of CMU whose header declares twice the rate of the capture.
+
+    Args:
+        path: The file, named as in CMU's database: subject and trial.
+        fps: The rate that it declares [1/s].
+    """
+    named = re.fullmatch(r"0*(\d+)_\d+", pathlib.Path(str(path)).stem)
+    if named is None or named[1] not in _SLOW_SUBJECTS or fps != 120:
+        return None
+    return (
+        f"CMU's subject {named[1]} was captured at 60 frames per second, but its files"
+        " declare 120: pass --source-fps 60."
     )

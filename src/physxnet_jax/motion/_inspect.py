@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..body import Body, load_body
 from ..io import GLTF_FORMATS
-from ._faults import sudden_turns
+from ._faults import declared_too_fast, sudden_turns
 from ._gltf import other_animations, split_animation
 from ._load import fitted_motion, read_motion
 from ._motion import Motion, resample
@@ -25,8 +25,6 @@ from ._source import SourceClip
 _UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "inches": 0.0254, "5.6 cm (CMU)": 0.0254 / 0.45}
 # Joints of trunk, head and feet; others, such as thumbs, don't affect the cloth.
 _CHECKED = ("LowerBack", "Spine", "Spine1", "Neck", "Head", "Shoulder", "ToeBase")
-# CMU subjects whose converted files declare 120 frames per second and have 60.
-_SLOW_SUBJECTS = ("60", "61")
 # Largest ratio between the legs' length and the body's at which a unit is recognised.
 _MAX_LEG_RATIO = 1.35
 # Plausible limits: speed of the hips [m/s]; feet above or below the floor [m].
@@ -150,12 +148,9 @@ def inspect_motion(
         notes.append(f"{', '.join(left_out)} follow their parents: the skeleton lacks them.")
     if found.added:
         notes.append(f"{', '.join(found.added)} are matched by name, not by the joint map.")
-    subject = pathlib.Path(str(motion)).stem.partition("_")[0].lstrip("0")
-    if subject in _SLOW_SUBJECTS and clip.fps == 120 and found.family.startswith("cmu"):
-        notes.append(
-            f"CMU's subject {subject} was captured at 60 frames per second, but its files"
-            " declare 120: pass --source-fps 60."
-        )
+    slower = declared_too_fast(motion, clip.fps) if found.family.startswith("cmu") else None
+    if slower is not None:
+        notes.append(slower)
     if clip.fps != _RATE and str(motion) not in CLIPS:
         notes.append(
             f"{clip.fps:g} frames per second are resampled to 30; --fps sets another rate."

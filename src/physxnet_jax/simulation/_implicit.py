@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..errors import check_counts, check_numbers
+from ..errors import SimulationError, check_counts, check_numbers
 from ..typing import pytree
 from ._effect import Prepared, Step
 from ._solver import TOLERANCE, Solver, accelerate_all, split, stored_energy
@@ -231,6 +231,12 @@ class Pattern:
 def _pattern(scene: "PreparedScene") -> Pattern:
     count = len(scene.assembly.rest)
     elastic = [e for e in scene.effects if e.elastic]
+    for e in elastic:
+        if type(e).coupled is Prepared.coupled:
+            raise SimulationError(
+                f"{type(e).__name__.lstrip('_')} stores energy but does not implement `coupled`"
+                " and `hessian`, which Implicit requires. Implement them, or choose XPBD or Verlet."
+            )
     pairs = [np.asarray(e.coupled(), np.int64).reshape(-1, 2) for e in elastic]
     own = np.repeat(np.arange(count)[:, None], 2, axis=1)
     every = np.unique(np.concatenate([own, *pairs]), axis=0)

@@ -15,10 +15,10 @@ from ...garment import SkinnedGarment
 from ...geometry import (
     Stencil,
     TriMesh,
-    fast_argmin,
     gaussian_stencil,
     map_frames,
     mesh_edges,
+    nearest_index,
     safe_normalize,
     spread_points,
     vertex_normals,
@@ -226,9 +226,9 @@ def faces_near(
     # no derivative.
     places, p = jax.lax.stop_gradient((skin[collider.places].T, points.T))
     order = collider.choices.T
-    squared = jnp.sum(jnp.stack([q[None] - s[order] for q, s in zip(p, places)]) ** 2, axis=0)
-    near = fast_argmin(squared, axis=0)
-    return collider.table[collider.choices[jnp.arange(near.shape[0]), near]]
+    a, b, c = (q[None] - s[order] for q, s in zip(p, places, strict=True))
+    near = nearest_index(a * a + b * b + c * c)
+    return collider.table[jnp.take_along_axis(order, near[None], axis=0)[0]]
 
 
 def minimum_clearance(

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ...geometry import closest_barycentric, nearest_index
+from ...geometry import closest_barycentric, nearest_distinct, nearest_index
 
 # Triangles of a patch that are compared exactly: those with the nearest middles.
 _EXACT = 3
@@ -53,20 +53,14 @@ def nearest_face(
         faces: All triangles.
         patch: Indices of each point's candidates.
     """
-    # Arithmetic that is fused with gathers or with the search isn't vectorised.
+    # Arithmetic that is fused with gathers isn't vectorised.
     apart = jax.lax.optimization_barrier
     p = jnp.moveaxis(points, 1, 0)
     middles = apart((x[faces[:, 0]] + x[faces[:, 1]] + x[faces[:, 2]]) / 3.0)
-    a, b, c = (m - q[None] for m, q in zip(apart(gather(middles, patch)), p, strict=True))
-    gap = a * a + b * b + c * c
     few = patch
     if len(patch) > _EXACT:
-        chosen = []
-        for _ in range(_EXACT):
-            chosen.append(jnp.take_along_axis(patch, nearest_index(gap)[None], axis=0))
-            # A patch may list a triangle twice.
-            gap = jnp.where(patch == chosen[-1], jnp.inf, gap)
-        few = jnp.concatenate(chosen)
+        a, b, c = (m - q[None] for m, q in zip(gather(middles, patch), p, strict=True))
+        few = nearest_distinct(a * a + b * b + c * c, patch, _EXACT)
     tri = apart(gather_corners(x, faces[few], axis=-1))
     _, squared = closest_barycentric(jnp.broadcast_to(p[:, None], tri[0].shape), *tri)
     return jnp.take_along_axis(few, nearest_index(apart(squared))[None], axis=0)[0]

@@ -31,6 +31,9 @@ class Seam(Effect):
 
     def __post_init__(self) -> None:
         check_numbers(self, "stiffness")
+        wrong = [s for s in self.stitches if len(s) != 2]
+        if wrong:
+            raise ValueError(f"a stitch is a pair of vertices, not {wrong[0]}")
 
     def idle(self, assembly: Assembly) -> bool:
         """Without stitches."""
