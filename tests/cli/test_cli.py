@@ -390,3 +390,17 @@ def test_a_file_that_cannot_be_read_hides_no_other(tmp_path, capsys):
     assert main(["inspect", *gone]) == 2
     said = "".join(capsys.readouterr().err.split())
     assert "gone.bvh" in said and "lost.bvh" in said
+
+
+@pytest.mark.release
+def test_what_a_person_should_look_at_is_said_at_the_end(monkeypatch, capsys):
+    words = ["walk", "--wear", "bottom", "--frames", "2"]
+    runs = (["dress", *words, "--method", "lbs"], ["simulate", *words, "--accuracy", "draft"])
+    for limit, said in ((1.0, False), (-1.0, True)):
+        monkeypatch.setattr(_dress, "_MUCH_INSIDE", limit)
+        for run in runs if said else runs[:1]:
+            assert main([*run, "--json"]) == 0
+            notes = json.loads(capsys.readouterr().out)["notes"]
+            assert any("vertices are inside" in n for n in notes) == said
+            assert main(run) == 0
+            assert ("vertices are inside" in capsys.readouterr().out) == said

@@ -25,7 +25,7 @@ from physxnet_jax.dressing import (
 from physxnet_jax.dressing._clothe import _check_pose
 from physxnet_jax.errors import PhysXNetError
 from physxnet_jax.models import PAPER, fold_batch_norm, load_predictor
-from physxnet_jax.motion import load_motion
+from physxnet_jax.motion import _transforms, load_motion
 
 
 @pytest.fixture(scope="module")
@@ -344,7 +344,7 @@ print(len(jax.devices()), "devices")
 
 @pytest.mark.release
 @pytest.mark.parametrize("fps", [30.0, 120.0])
-def test_clip_starts_without_a_jump(fps):
+def test_clip_starts_without_a_jump(fps, monkeypatch):
     """Clips cut out of a walk begin as the walk goes on, however many frames there are a second."""
     walk = load_motion("walk", fps=fps)
     inference = Inference(weights="nano", strain_iterations=0, collisions=False)
@@ -354,7 +354,7 @@ def test_clip_starts_without_a_jump(fps):
     frames = int(0.4 * fps)
 
     def begin(still):
-        """Error to the whole walk, and largest acceleration over its own; means of eight starts."""
+        """Mean error of eight starts to the whole walk, and largest acceleration over its own."""
         errors, jumps = [], []
         for k in range(1, 9):
             start = int(0.3 * k * fps)
@@ -367,14 +367,20 @@ def test_clip_starts_without_a_jump(fps):
             second = [np.linalg.norm(np.diff(x[:6], n=2, axis=0), axis=2) for x in (cloth, true)]
             now, usual = (np.quantile(x, 0.99, axis=1).max() for x in second)
             jumps.append(now / usual)
-        return np.mean(errors), np.mean(jumps)
+        return np.mean(errors), np.max(jumps)
 
     error, jump = begin(still=False)
     thrown_error, thrown = begin(still=True)
-    assert jump < 1.2
+    assert jump < 2.0
     assert error < 0.8 * thrown_error
     if fps > 100:
-        assert thrown > 2.0
+        assert thrown > 5.0
+    with monkeypatch.context() as patch:
+        # The other control: limbs that have always turned as in the first frames.
+        patch.setattr(_transforms, "_SWING", 1e6)
+        jax.clear_caches()
+        assert error < 0.9 * begin(still=False)[0]
+    jax.clear_caches()
     clip = dataclasses.replace(walk, rotations=walk.rotations[15:47], root=walk.root[15:47])
     worn = run(dresser, clip.rotations, clip.root, fps=fps)["trousers"]
     again = dress(

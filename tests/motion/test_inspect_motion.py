@@ -19,7 +19,6 @@ from physxnet_jax.cli._options import BodyOptions, MotionSource, Outfit
 from physxnet_jax.errors import MotionError
 from physxnet_jax.motion import (
     JOINT_MAPS,
-    declared_too_fast,
     load_motion,
     procedural_clip,
     read_bvh,
@@ -28,6 +27,8 @@ from physxnet_jax.motion import (
     sudden_turns,
 )
 from physxnet_jax.motion._inspect import _skeleton
+
+standing_bvh = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))["standing_bvh"]
 
 _TESTS = pathlib.Path(__file__).parent
 _write_gltf = runpy.run_path(str(_TESTS / "test_gltf_motion.py"))["write_gltf"]
@@ -217,14 +218,25 @@ def test_motion_options_are_refused_for_a_garment(capsys):
 
 
 def test_rates_that_cmu_declares_twice_too_high_are_noted(tmp_path):
-    """Dressing says it as inspecting does; not where a rate is given."""
-    for name in ("060_10.bvh", "61_01.amc", "a/60_03.bvh"):
-        assert "pass --source-fps 60" in (declared_too_fast(name, 120.0) or "")
-    for name, fps in (("060_10.bvh", 60.0), ("06_10.bvh", 120.0), ("60.bvh", 120.0)):
-        assert declared_too_fast(name, fps) is None
-    save_motion(tmp_path / "60_01.npz", load_motion("walk", fps=120.0))
-    for rate, noted in ((None, 1), (60.0, 0)):
-        source = MotionSource(source_fps=rate)
-        word = str(tmp_path / "60_01.npz")
-        job = _job(word, source, Outfit(), BodyOptions(), {"method": "network"}, lambda *_: None)
-        assert len(job.notes) == noted
+    """Dressing says it as inspecting does; not where a rate is given, nor of other skeletons."""
+    theirs = re.sub(
+        r"(ROOT|JOINT) (\w+)",
+        lambda k: f"{k[1]} {JOINT_MAPS['cmu-daz'].get(k[2], k[2])}",
+        standing_bvh(),
+    )
+
+    def notes(name, text, rate, **source):
+        file = tmp_path / name
+        file.write_text(text.replace("0.0333333", f"{1.0 / rate:.8f}"))
+        options = (Outfit(), BodyOptions(), {"method": "network"}, lambda *_: None)
+        said = _job(str(file), MotionSource(**source), *options).notes
+        inspected = inspect_motion(file, **source).notes
+        assert len(said) == sum("--source-fps 60" in n for n in inspected)
+        return len(said)
+
+    for name in ("060_10.bvh", "61_01_walk.bvh"):
+        assert notes(name, theirs, 120.0) == 1
+    assert notes("060_10.bvh", theirs, 120.0, source_fps=60.0) == 0
+    assert notes("060_10.bvh", theirs, 60.0) == 0
+    assert notes("06_10.bvh", theirs, 120.0) == 0
+    assert notes("060_10.bvh", standing_bvh(), 120.0) == 0

@@ -28,7 +28,7 @@ from ..files import check_writable
 from ..frames import IN_MEMORY, scratch_folder
 from ..io import GltfFile, check_output, write_clip
 from ..models import read_card
-from ..motion import Motion, declared_too_fast, load_motion
+from ..motion import Motion, declared_too_fast, load_motion, read_motion, slow_subject
 from ..viewer import check_preview, render_preview
 from ._calibrate import choose
 from ._clock import lap
@@ -91,14 +91,25 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
         clip, written, _ = _run(job, output, pictures, command.picture, progress)
     if command.terminal.json:
         choice = {} if selected is None else {"picked": selected.summary}
-        print_json(report(clip) | choice | {"files": written})
+        notes = {"notes": [*job.notes, *clip.notes, *_pierced(clip)]}
+        print_json(report(clip) | notes | choice | {"files": written})
         return _code(output, clip)
     for table in closing_table(clip):
         console.print(table)
     if selected is not None:
         console.print(selected.summary, highlight=False)
-    _print_end(clip, _lost(job, output), written, console)
+    _print_end(clip, (*job.notes, *_lost(job, output), *_pierced(clip)), written, console)
     return _code(output, clip)
+
+
+def _pierced(clip: DressedClip) -> tuple[str, ...]:
+    """A note on each garment of which more is inside the body than cloth on a limb explains."""
+    return tuple(
+        f"{name}: {share:.1%} of its vertices are inside the body, {clip.worst[name][1]:.1%} in"
+        f" frame {clip.worst[name][0]}: look there."
+        for name, share in clip.inside.items()
+        if (share or 0.0) > _MUCH_INSIDE and name in clip.worst
+    )
 
 
 def run_simulate(command: Simulate, console: Console) -> int:
@@ -119,11 +130,11 @@ def run_simulate(command: Simulate, console: Console) -> int:
         job = dataclasses.replace(job, simulation=simulation)
         clip, written, seconds = _run(job, output, pictures, command.picture, progress)
     if command.terminal.json:
-        files = {"notes": [*job.notes, *clip.notes], "files": written}
+        files = {"notes": [*job.notes, *clip.notes, *_pierced(clip)], "files": written}
         print_json(rollout_report(clip, seconds) | files)
         return _code(output, clip)
     console.print(rollout_table(clip, job.simulation, seconds))
-    _print_end(clip, (*job.notes, *_lost(job, output)), written, console)
+    _print_end(clip, (*job.notes, *_lost(job, output), *_pierced(clip)), written, console)
     return _code(output, clip)
 
 
@@ -148,6 +159,8 @@ def run_demo(command: Demo, console: Console) -> int:
     return run_dress(job, console, still=command.out / "demo.png")
 
 
+# Share of a garment inside the body beyond which a person should look at it.
+_MUCH_INSIDE = 0.02
 # Options that overrule a scene file.
 _OVER_SCENE = ("--accuracy", "--engine", "--refine", "--substeps")
 
@@ -179,8 +192,11 @@ def scene_file(command: Simulate | Effects) -> Any:
 def _scene_job(command: Simulate) -> _Job:
     found = scene_file(command)
     options = command.simulation
+    notes = found.notes
     if options.engine == "xpbd":
         options = dataclasses.replace(options, accuracy=options.accuracy or found.accuracy)
+    elif found.accuracy != "standard":
+        notes = (*notes, f"{command.scene}: its accuracy is xpbd's; {options.engine} has its own.")
     simulation = options.build()
     if options.engine in EXTERNAL_ENGINES:
         if found.lists_effects:
@@ -199,7 +215,7 @@ def _scene_job(command: Simulate) -> _Job:
         frames=None,
         fps=found.motion.fps,
         start=0.0,
-        notes=found.notes,
+        notes=notes,
     )
 
 
@@ -256,10 +272,10 @@ def _job(
 
 def _slower(word: str, source: MotionSource) -> tuple[str, ...]:
     """A note where the file's rate is known to be wrong, and isn't given."""
-    if source.source_fps is not None or declared_too_fast(word, 120.0) is None:
+    given = source.source_fps is not None or source.joint_map is not None
+    if given or slow_subject(word) is None:
         return ()
-    own = load_motion(word, skeleton=source.skeleton, up=source.up, joint_map=source.joint_map).fps
-    note = declared_too_fast(word, own)
+    note = declared_too_fast(word, read_motion(word, skeleton=source.skeleton, up=source.up))
     return () if note is None else (f"{word}: {note}",)
 
 
@@ -395,7 +411,8 @@ def _lost(job: _Job, output: Output) -> tuple[str, ...]:
     if out is None or not isinstance(job.motion, Character) or not output.body:
         return ()
     if _keeps_rig(job.motion, output):
-        meshes = GltfFile(job.motion.rig.path).document.meshes if job.motion.rig else []
+        assert job.motion.rig is not None
+        meshes = GltfFile(job.motion.rig.path).document.meshes
         if not any(part.targets for mesh in meshes for part in mesh.primitives):
             return ()
         return ("the character's expressions (morph targets) are kept, but not animated",)

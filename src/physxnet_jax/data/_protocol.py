@@ -120,8 +120,8 @@ def write_protocol(
 ) -> tuple[pathlib.Path, tuple[str, ...]]:
     """Writes ``ACTIONS.csv`` for a folder of motion files, to be edited.
 
-    Every file becomes an action over its whole length; every fifth is a test action, of fewer
-    than five the last.
+    Every file becomes an action over its whole length; every fifth is a test action, of two to
+    four the last.
 
     Args:
         folder: The folder; files in folders below it count too.

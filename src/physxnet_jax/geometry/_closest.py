@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
@@ -238,8 +239,7 @@ def nearest_indices(
     """`nearest_index` of several arrays in one pass, into which their computation is fused."""
     keys, masks = zip(*(_indexed(x) for x in squared), strict=True)
     start = (jnp.iinfo(jnp.int32).max,) * len(keys)
-    lower = functools.partial(jax.tree.map, jnp.minimum)
-    smallest = jax.lax.reduce(keys, tuple(map(jnp.int32, start)), lower, (0,))
+    smallest = jax.lax.reduce(keys, tuple(map(jnp.int32, start)), _lower, (0,))
     rows = squared[0].shape[0]
     return tuple(jnp.minimum(x & m, rows - 1) for x, m in zip(smallest, masks, strict=True))
 
@@ -250,8 +250,8 @@ def nearest_distinct(
     """Labels of the smallest values along the first axis, the smallest first, each label once.
 
     One pass, into which the values' own computation is fused: twice as fast as a search that
-    is repeated without what was found. As precise as `nearest_index`. Where there are fewer
-    labels, the first row's is repeated.
+    is repeated without what was found. As precise as `nearest_index`; values that count as equal
+    may come in any order. Where there are fewer labels, the first row's is repeated.
 
     Args:
         squared: Values of at least 0, as squared distances; equal where labels are.
@@ -259,24 +259,35 @@ def nearest_distinct(
         count: Number of labels.
     """
     last, none = jnp.iinfo(jnp.int32).max, -1
+    keys, _ = _indexed(squared)
+    labels = labels.astype(jnp.int32)
+    empty = (jnp.full_like(keys, last),) * (count - 1), (jnp.full_like(keys, none),) * (count - 1)
+    start = (jnp.int32(last),) * count + (jnp.int32(none),) * count
+    operands = (keys, *empty[0], labels, *empty[1])
+    found = jax.lax.reduce(operands, start, _merger(count), (0,))[count:]
+    return jnp.stack([jnp.where(x < 0, labels[0], x) for x in found])
+
+
+def _lower(kept: tuple[Array, ...], more: tuple[Array, ...]) -> tuple[Array, ...]:
+    return tuple(jnp.minimum(a, b) for a, b in zip(kept, more, strict=True))
+
+
+@functools.cache
+def _merger(count: int) -> Callable[[tuple[Array, ...], tuple[Array, ...]], tuple[Array, ...]]:
+    """Merges sorted keys and their labels; one function for each count, or JAX traces anew."""
 
     def merged(kept: tuple[Array, ...], more: tuple[Array, ...]) -> tuple[Array, ...]:
         keys, names = list(kept[:count]), list(kept[count:])
         for key, name in zip(more[:count], more[count:], strict=True):
             known = functools.reduce(jnp.logical_or, (name == other for other in names))
-            key = jnp.where(known, last, key)
+            key = jnp.where(known, jnp.iinfo(jnp.int32).max, key)
             for k in range(count):
                 less = key < keys[k]
                 keys[k], key = jnp.where(less, key, keys[k]), jnp.where(less, keys[k], key)
                 names[k], name = jnp.where(less, name, names[k]), jnp.where(less, names[k], name)
         return (*keys, *names)
 
-    keys, _ = _indexed(squared)
-    labels = labels.astype(jnp.int32)
-    empty = (jnp.full_like(keys, last),) * (count - 1), (jnp.full_like(keys, none),) * (count - 1)
-    start = (jnp.int32(last),) * count + (jnp.int32(none),) * count
-    found = jax.lax.reduce((keys, *empty[0], labels, *empty[1]), start, merged, (0,))[count:]
-    return jnp.stack([jnp.where(x < 0, labels[0], x) for x in found])
+    return merged
 
 
 def _indexed(squared: Float[Array, " rows *others"]) -> tuple[Int[Array, " rows *others"], int]:

@@ -2,15 +2,23 @@
 
 from ._asf_amc import read_amc as read_amc
 from ._bvh import read_bvh as read_bvh
-from ._faults import declared_too_fast as declared_too_fast, sudden_turns as sudden_turns
+from ._faults import slow_subject as slow_subject, sudden_turns as sudden_turns
 from ._fit_motion import fit_motion as fit_motion
 from ._gltf import (
     read_gltf as read_gltf,
     read_rig as read_rig,
     split_animation as split_animation,
 )
-from ._inspect import MotionInspection as MotionInspection, inspect_motion as inspect_motion
-from ._load import load_motion as load_motion, save_motion as save_motion
+from ._inspect import (
+    MotionInspection as MotionInspection,
+    declared_too_fast as declared_too_fast,
+    inspect_motion as inspect_motion,
+)
+from ._load import (
+    load_motion as load_motion,
+    read_motion as read_motion,
+    save_motion as save_motion,
+)
 from ._motion import (
     ROTATION_LENGTHS as ROTATION_LENGTHS,
     Motion as Motion,

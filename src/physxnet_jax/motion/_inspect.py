@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..body import Body, load_body
 from ..io import GLTF_FORMATS
-from ._faults import declared_too_fast, sudden_turns
+from ._faults import slow_subject, sudden_turns
 from ._gltf import other_animations, split_animation
 from ._load import fitted_motion, read_motion
 from ._motion import Motion, resample
@@ -148,7 +148,7 @@ def inspect_motion(
         notes.append(f"{', '.join(left_out)} follow their parents: the skeleton lacks them.")
     if found.added:
         notes.append(f"{', '.join(found.added)} are matched by name, not by the joint map.")
-    slower = declared_too_fast(motion, clip.fps) if found.family.startswith("cmu") else None
+    slower = declared_too_fast(motion, read) if mapping is None else None
     if slower is not None:
         notes.append(slower)
     if clip.fps != _RATE and str(motion) not in CLIPS:
@@ -174,6 +174,24 @@ def inspect_motion(
         problems=tuple(trajectory.problems),
         notes=tuple(notes),
         command=" ".join(words),
+    )
+
+
+def declared_too_fast(path: str | pathlib.Path, read: SourceClip | Motion) -> str | None:
+    """A note on files of CMU that declare twice the rate of their capture.
+
+    Args:
+        path: The file, named as in CMU's database.
+        read: What it contains, on a skeleton whose joints are known.
+    """
+    subject = slow_subject(path)
+    if subject is None or isinstance(read, Motion) or read.fps != 120:
+        return None
+    if not find_joint_map(read)[0].startswith("cmu"):
+        return None
+    return (
+        f"CMU's subject {subject} was captured at 60 frames per second, but its files"
+        " declare 120: pass --source-fps 60."
     )
 
 

@@ -232,7 +232,9 @@ def _pattern(scene: "PreparedScene") -> Pattern:
     count = len(scene.assembly.rest)
     elastic = [e for e in scene.effects if e.elastic]
     for e in elastic:
-        if type(e).coupled is Prepared.coupled:
+        values = (type(e).hessian, type(e).constant_stiffness)
+        nothing = values == (Prepared.hessian, Prepared.constant_stiffness)
+        if nothing or type(e).coupled is Prepared.coupled:
             raise SimulationError(
                 f"{type(e).__name__.lstrip('_')} stores energy but does not implement `coupled`"
                 " and `hessian`, which Implicit requires. Implement them, or choose XPBD or Verlet."
