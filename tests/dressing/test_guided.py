@@ -161,7 +161,8 @@ def test_gradients_by_the_pose(guided, motion):
     """Along the root's height, in float64: contact begins and ends within 0.1 micrometres."""
     with jax.enable_x64(True):
         person = in_double(guided)
-        q, p = wide((motion.rotations[:4], motion.root[:4]))
+        # Four frames in which no contact begins or ends within the step of the differences.
+        q, p = wide((motion.rotations[2:6], motion.root[2:6]))
 
         @jax.jit
         def height(dy):
