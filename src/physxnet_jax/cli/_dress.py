@@ -50,6 +50,11 @@ from ._table import closing_table, report, rollout_report, rollout_table
 
 _Progress = Callable[[str, int, int], None]
 
+# Share of a garment inside the body beyond which a person should look at it.
+_MUCH_INSIDE = 0.02
+# Options that overrule a scene file.
+_OVER_SCENE = ("--accuracy", "--engine", "--refine", "--substeps")
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class _Job:
@@ -157,12 +162,6 @@ def run_demo(command: Demo, console: Console) -> int:
         terminal=command.terminal,
     )
     return run_dress(job, console, still=command.out / "demo.png")
-
-
-# Share of a garment inside the body beyond which a person should look at it.
-_MUCH_INSIDE = 0.02
-# Options that overrule a scene file.
-_OVER_SCENE = ("--accuracy", "--engine", "--refine", "--substeps")
 
 
 def is_scene_file(word: str) -> bool:

@@ -375,8 +375,6 @@ def _convert_setting(field: dataclasses.Field, value: Any, within: bool = False)
         nested = str(field.type).startswith("tuple[tuple[")
         if any(isinstance(v, list) != (nested and not within) for v in value):
             raise TypeError(f"{field.name} is {'' if nested else 'not '}a list of lists")
-        if within and nested and len(value) != 2:
-            raise TypeError(f"{field.name} has {value!r}, expected a pair of vertices")
         return tuple(_convert_setting(field, v, within=True) for v in value)
     wants_float = field.type is float or "float" in str(field.type)
     if wants_float and (isinstance(value, bool) or not isinstance(value, int | float)):

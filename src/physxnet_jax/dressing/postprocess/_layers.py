@@ -163,12 +163,11 @@ def resolve_layer(
         other: Vertices of the fixed garment [m].
         points: Vertices of the moved garment [m].
     """
-    normals = vertex_normals(other, layer.faces)
-    move = jnp.zeros_like(points).at[layer.rows].set(_correction(layer, other, normals, points))
+    move = jnp.zeros_like(points).at[layer.rows].set(_correction(layer, other, points))
     # A smoothed step keeps vertices in their neighbourhood. The second step is exact; it searches
     # again because another triangle may now be the nearest.
     points = points + (move if layer.carry is None else layer.carry @ move)
-    return points.at[layer.rows].add(_correction(layer, other, normals, points))
+    return points.at[layer.rows].add(_correction(layer, other, points))
 
 
 def apply_layers(
@@ -198,15 +197,7 @@ def layer_height(
     layer: Layer, other: Float[Array, "still 3"], points: Float[Array, "moved 3"]
 ) -> tuple[Float[Array, " rows"], Float[Array, " rows"], Float[Array, "rows 3"]]:
     """Heights above the other garment [m], lateral distances from it [m] and its unit normals."""
-    return _height(layer, other, vertex_normals(other, layer.faces), points)
-
-
-def _height(
-    layer: Layer,
-    other: Float[Array, "still 3"],
-    normals: Float[Array, "still 3"],
-    points: Float[Array, "moved 3"],
-) -> tuple[Float[Array, " rows"], Float[Array, " rows"], Float[Array, "rows 3"]]:
+    normals = vertex_normals(other, layer.faces)
     queries = points[layer.rows]
     closest, normal = closest_skin_point(other, normals, layer.faces, queries, layer.candidates)
     height = jnp.sum((queries - closest) * normal, axis=1)
@@ -218,12 +209,9 @@ def _height(
 
 
 def _correction(
-    layer: Layer,
-    other: Float[Array, "still 3"],
-    normals: Float[Array, "still 3"],
-    points: Float[Array, "moved 3"],
+    layer: Layer, other: Float[Array, "still 3"], points: Float[Array, "moved 3"]
 ) -> Float[Array, "rows 3"]:
-    height, lateral, normal = _height(layer, other, normals, points)
+    height, lateral, normal = layer_height(layer, other, points)
     fade = jnp.clip((height + _MAX_DEPTH) / (0.25 * _MAX_DEPTH), 0.0, 1.0)
     fade = fade * jnp.clip(1.0 - lateral / _HEM_FADE, 0.0, 1.0)
     return (fade * jnp.maximum(layer.least - height, 0.0))[:, None] * normal
