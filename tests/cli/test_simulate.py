@@ -274,7 +274,7 @@ def test_motions_are_simulated_at_the_requested_rate():
         ('motion = "walk"\n[effects.seam]\nstitches = [0, 5]', "stitches is a list of lists"),
         (
             'motion = "walk"\n[effects.seam]\nstitches = [[0, 5, 6]]',
-            "seam: .*(pair of vertices|stitches)",
+            r"(?s)seam: .*(pair of vertices|stitches)",
         ),
         ('motion = "walk"\n[effects.seam]\nstitches = [[0, 5.5]]', "a whole number"),
         ('motion = "walk"\n[effects.air]\nwind = [[0, 0, 4]]', "wind is not a list of lists"),
