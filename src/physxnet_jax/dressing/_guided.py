@@ -29,10 +29,14 @@ from .postprocess import (
     BodyCollider,
     Layer,
     Outfit,
+    StrainLimits,
     apply_contacts,
+    apply_strain,
     prepare_collisions,
     prepare_layers,
+    prepare_strain,
     reshape_colliders,
+    reshape_strain,
 )
 
 Posed = tuple[Float[Array, "_ 3"], ...]
@@ -49,6 +53,8 @@ _RATE = 30.0
 _TIME_CONSTANT, _LONGEST = 0.0025, 0.02
 # Distance between the middles of patches [m]: nearer ones pass on the network's own noise.
 _SPACING = 0.12
+# Iterations of strain limiting of the first frame.
+_STRAIN = 32
 # Distance of a patch from its prediction at which the cloth starts anew [m].
 _ASTRAY = 0.4
 
@@ -63,6 +69,7 @@ class GuidedScene:
         solver: Its solver at 30 frames per second.
         order: Place of each of the scene's garments among the dresser's.
         parts: First vertex of each of the scene's garments, and the number of vertices.
+        strain: Strain limits of each garment, for the first frame.
         colliders: The skin near each garment, for the first frame.
         layers: Pairs of garments whose order is enforced there.
     """
@@ -71,6 +78,7 @@ class GuidedScene:
     solver: Solver = dataclasses.field(metadata={"static": True})
     order: tuple[int, ...] = dataclasses.field(metadata={"static": True})
     parts: tuple[int, ...] = dataclasses.field(metadata={"static": True})
+    strain: StrainLimits | None
     colliders: tuple[BodyCollider, ...] | None
     layers: tuple[Layer, ...] | None
 
@@ -156,6 +164,7 @@ def prepare_guided(
         solver=solver,
         order=tuple(places[id(g)] for g in scene.garments),
         parts=prepared.assembly.parts,
+        strain=prepare_strain(outfit, Inference(strain_iterations=_STRAIN)),
         colliders=prepare_collisions(outfit, Inference()),
         layers=prepare_layers(outfit, Inference()),
     )
@@ -165,7 +174,7 @@ def reshape_guided(
     scene: GuidedScene,
     body: Body,
     rest: Float[Array, "all 3"],
-    cloth: Posed,
+    worn: tuple[SkinnedGarment, ...],
 ) -> GuidedScene:
     """The scene for a body and garments of other rest shapes; pure, see `System.reshaped`.
 
@@ -173,12 +182,14 @@ def reshape_guided(
         scene: From `prepare_guided`.
         body: The body.
         rest: Its rest vertices [m].
-        cloth: Rest vertices of the dresser's garments [m].
+        worn: The dresser's garments with their rest vertices.
     """
-    new = scene.with_system(scene.system.reshaped(scene.joined(cloth)[:, :, 0], rest))
-    if scene.colliders is None:
-        return new
-    return dataclasses.replace(new, colliders=reshape_colliders(scene.colliders, body, rest))
+    cloth = scene.joined(tuple(w.rest for w in worn))[:, :, 0]
+    return dataclasses.replace(
+        scene.with_system(scene.system.reshaped(cloth, rest)),
+        strain=scene.strain and reshape_strain(scene.strain, worn),
+        colliders=scene.colliders and reshape_colliders(scene.colliders, body, rest),
+    )
 
 
 def _contact(garments: int) -> tuple[Effect, ...]:
@@ -292,11 +303,13 @@ def advance_guided(
             for r, t in ((rotations, translations), (state.rotations, state.translations))
         )
         place = skinned + scene.guide.spread(means - scene.guide.means(skinned))
-        # Outside the skin: what begins within shows for many frames.
+        # Without slits where legs tear skinned cloth apart, and outside the skin: what begins
+        # within shows for many frames.
         cloth = tuple(x[None] for x in scene.parted(place))
-        cloth = apply_contacts(
-            scene.colliders, scene.layers, cloth, rotations[None], translations[None]
-        )
+        at = rotations[None], translations[None]
+        if scene.strain is not None:
+            cloth = apply_strain(scene.strain, cloth, *at)
+        cloth = apply_contacts(scene.colliders, scene.layers, cloth, *at)
         place = scene.joined(tuple(x[0] for x in cloth))
         begun = start_state(system, place, fps * (skinned - before), solver=solver, fps=fps)
         # Both branches must have one type: `start_state` gives weak ones.

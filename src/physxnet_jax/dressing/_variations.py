@@ -131,5 +131,5 @@ def _varied(
         worn=worn,
         strain=None if strain is None else reshape_strain(strain, worn),
         colliders=None if colliders is None else reshape_colliders(colliders, dresser.body, rest),
-        guided=None if guided is None else reshape_guided(guided, dresser.body, rest, cloth),
+        guided=None if guided is None else reshape_guided(guided, dresser.body, rest, worn),
     )
