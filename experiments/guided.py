@@ -38,7 +38,7 @@ from physxnet_jax.dressing import (
     make_dresser,
     pose_clip,
 )
-from physxnet_jax.evaluation import likeness, machine, skinning
+from physxnet_jax.evaluation import likeness, machine, skinning, vertex_error
 from physxnet_jax.files import atomic_write, write_json
 from physxnet_jax.garment import DEFAULT_KINDS, tailor
 from physxnet_jax.models import load_predictor
@@ -79,10 +79,6 @@ def cloth_of(dresser: Dresser, motion: Motion) -> np.ndarray:
     clip = pose_clip(dresser.body, dresser.rest, motion)
     name = dresser.worn[0].name
     return np.concatenate([b.positions[name] for b in infer_clip(dresser, clip)])
-
-
-def error(x: np.ndarray, y: np.ndarray) -> float:
-    return 1e3 * float(np.sqrt(np.mean(np.sum((x - y) ** 2, axis=-1))))
 
 
 def steps(data: str, weights: Any, action: str, template: str) -> Iterator[dict]:
@@ -131,7 +127,8 @@ def rates(data: str, weights: Any, action: str, template: str) -> Iterator[dict]
                 "action": action,
                 "method": method,
                 "fps": fps,
-                "ratio": error(cloth[there], truth[here]) / error(usual[here], truth[here]),
+                "ratio": vertex_error(cloth[there], truth[here]).rmse_mm
+                / vertex_error(usual[here], truth[here]).rmse_mm,
             }
 
 

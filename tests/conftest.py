@@ -1,6 +1,8 @@
 """Shapes are checked by beartype; dtypes and ranks are never promoted silently."""
 
+import csv
 import ctypes
+import dataclasses
 import gc
 import json
 import os
@@ -105,6 +107,28 @@ def data_dir() -> pathlib.Path:
     if not (path / "mocap" / "ACTIONS.csv").is_file():
         pytest.skip(f"no motion data at {path}: set PHYSXNET_DATA")
     return path
+
+
+@pytest.fixture(scope="session")
+def write_mocap():
+    """Writes a folder of motion: a piece of the built-in punch, and the actions cut from it.
+
+    Called with the folder, the number of frames, and rows of split, action, start and frames.
+    """
+    from physxnet_jax.motion import load_motion, save_motion
+
+    def write(folder, count, actions):
+        clip = load_motion("punch", fps=30.0)
+        clip = dataclasses.replace(clip, rotations=clip.rotations[:count], root=clip.root[:count])
+        save_motion(folder / "punch.npz", clip)
+        with (folder / "ACTIONS.csv").open("w", newline="") as file:
+            table = csv.writer(file)
+            table.writerow(["split", "action", "file", "start_s", "frames_at_30fps"])
+            for split, action, start, frames in actions:
+                table.writerow([split, action, "punch.npz", start, frames])
+        return folder
+
+    return write
 
 
 @pytest.fixture

@@ -3,14 +3,11 @@
 In JSON files measured times may differ; tables and charts of such times need only be there.
 """
 
-import csv
-import dataclasses
 import json
 import os
 import pathlib
 import random
 import runpy
-import shutil
 import signal
 import subprocess
 import sys
@@ -21,7 +18,6 @@ import pytest
 
 from physxnet_jax._environment import compilation_cache_folder
 from physxnet_jax.data import dataset_digest
-from physxnet_jax.motion import load_motion, save_motion
 
 _DEVICES = runpy.run_path(str(pathlib.Path(__file__).with_name("test_devices.py")))
 finish, free_port, start, weights = (
@@ -36,16 +32,10 @@ solver = { substeps = 8, contact_updates = 1 }
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory):
+def place(tmp_path_factory, write_mocap):
     """Motions, a configuration and the digest of the undisturbed dataset."""
-    folder = tmp_path_factory.mktemp("kills")
-    clip = load_motion("punch", fps=30.0)
-    clip = dataclasses.replace(clip, rotations=clip.rotations[:60], root=clip.root[:60])
-    save_motion(folder / "punch.npz", clip)
-    with (folder / "ACTIONS.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["split", "action", "file", "start_s", "frames_at_30fps"])
-        table.writerows(["train", f"part {k}", "punch.npz", 0.2 * k, 5 + k] for k in range(6))
+    actions = [("train", f"part {k}", 0.2 * k, 5 + k) for k in range(6)]
+    folder = write_mocap(tmp_path_factory.mktemp("kills"), 60, actions)
     (folder / "sets.toml").write_text(SETS)
     done = build(folder, "plain")
     assert done.wait(200) == 0
@@ -60,15 +50,11 @@ def build(folder, out, *more):
 
 
 @pytest.fixture(scope="module")
-def tests_to_judge(place):
+def tests_to_judge(place, write_mocap):
     """A small dataset of test actions."""
     folder = place[0] / "tests"
     folder.mkdir()
-    shutil.copy(place[0] / "punch.npz", folder)
-    with (folder / "ACTIONS.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["split", "action", "file", "start_s", "frames_at_30fps"])
-        table.writerows(["test", f"judged {k}", "punch.npz", 0.1 * k, 6] for k in range(3))
+    write_mocap(folder, 60, [("test", f"judged {k}", 0.1 * k, 6) for k in range(3)])
     (folder / "sets.toml").write_text(SETS.replace("train", "test"))
     assert build(folder, "judged").wait(300) == 0
     return folder / "judged"

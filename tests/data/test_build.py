@@ -1,6 +1,5 @@
 """Datasets built on a cluster have the bytes of those built in one process."""
 
-import csv
 import dataclasses
 import threading
 import time
@@ -10,23 +9,14 @@ import pytest
 from physxnet_jax.cli import main
 from physxnet_jax.data import DatasetConfig, build_dataset, dataset_digest, read_times
 from physxnet_jax.errors import PhysXNetError
-from physxnet_jax.motion import load_motion, save_motion
 from physxnet_jax.simulation import XPBD
 
 
 @pytest.fixture(scope="module")
-def mocap(tmp_path_factory):
+def mocap(tmp_path_factory, write_mocap):
     """Four short actions of a built-in clip."""
-    folder = tmp_path_factory.mktemp("mocap")
-    clip = load_motion("punch", fps=30.0)
-    clip = dataclasses.replace(clip, rotations=clip.rotations[:40], root=clip.root[:40])
-    save_motion(folder / "punch.npz", clip)
-    with (folder / "ACTIONS.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["split", "action", "file", "start_s", "frames_at_30fps"])
-        for k in range(4):
-            table.writerow(["train", f"part {k}", "punch.npz", 0.3 * k, 6 + k])
-    return folder
+    actions = [("train", f"part {k}", 0.3 * k, 6 + k) for k in range(4)]
+    return write_mocap(tmp_path_factory.mktemp("mocap"), 40, actions)
 
 
 CONFIG = DatasetConfig(splits=("train",), templates=("bottom",), people=2, solver=XPBD(8, 1))

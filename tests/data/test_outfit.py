@@ -1,6 +1,5 @@
 """Datasets of outfits: who wears what, and what is read again."""
 
-import csv
 import dataclasses
 
 import numpy as np
@@ -18,7 +17,6 @@ from physxnet_jax.data import (
     read_entry,
 )
 from physxnet_jax.errors import PhysXNetError
-from physxnet_jax.motion import load_motion, save_motion
 from physxnet_jax.simulation import XPBD
 
 PAIR = Outfit(wear=("trousers", "tee:ease=0.2"), shape=("weight_up=0.5",))
@@ -26,17 +24,9 @@ ALONE = Outfit(wear=("strapless:fabric=silk",))
 
 
 @pytest.fixture(scope="module")
-def mocap(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("mocap")
-    clip = load_motion("punch", fps=30.0)
-    clip = dataclasses.replace(clip, rotations=clip.rotations[:40], root=clip.root[:40])
-    save_motion(folder / "punch.npz", clip)
-    with (folder / "ACTIONS.csv").open("w", newline="") as file:
-        table = csv.writer(file)
-        table.writerow(["split", "action", "file", "start_s", "frames_at_30fps"])
-        for k in range(4):
-            table.writerow(["train", f"part {k}", "punch.npz", 0.2 * k, 4 + k])
-    return folder
+def mocap(tmp_path_factory, write_mocap):
+    actions = [("train", f"part {k}", 0.2 * k, 4 + k) for k in range(4)]
+    return write_mocap(tmp_path_factory.mktemp("mocap"), 40, actions)
 
 
 @pytest.mark.release

@@ -10,6 +10,7 @@ from hypothesis import given, settings, strategies as st
 from physxnet_jax.geometry import (
     closest_among,
     closest_barycentric,
+    closest_on_host,
     closest_points,
     fast_argmin,
     make_mesh,
@@ -106,6 +107,12 @@ def test_candidate_search_matches_brute_force(body):
     miss = np.sqrt(np.asarray(quick.squared_distance)) - np.sqrt(np.asarray(exact.squared_distance))
     assert (miss > -1e-5).all()
     assert (miss > 1e-5).mean() < 0.01 and miss.max() < 2e-3
+    # By NumPy, in chunks; ties are at most a rounding apart.
+    face, weights, squared = closest_on_host(v, np.asarray(mesh.faces), points, near)
+    np.testing.assert_allclose(np.sqrt(squared), np.sqrt(quick.squared_distance), atol=1e-6)
+    foot = np.einsum("pk,pkc->pc", weights, v[np.asarray(mesh.faces)[face]])
+    np.testing.assert_allclose(np.sum((points - foot) ** 2, axis=1), squared, atol=1e-7)
+    assert len(closest_on_host(v, np.asarray(mesh.faces), points[:0], near[:0])[0]) == 0
     # Compared exactly only where the middles are nearest: nearly always the same point.
     few = closest_among(mesh, jnp.asarray(points), jnp.asarray(near), exactly=3)
     more = np.sqrt(np.asarray(few.squared_distance)) - np.sqrt(np.asarray(quick.squared_distance))

@@ -14,6 +14,7 @@ from ..data import Clothing, Sequence, garment_of, usable_garment
 from ..garment import Template
 from ..simulation import Assembly, prepare_scene
 from ..uv import Transference, garment_map_rows, make_atlas
+from ._likeness import LOOK_STRIDE
 from ._methods import Method, scene_of, skinning
 from ._metrics import vertex_error
 from ._motion_metrics import (
@@ -35,7 +36,6 @@ from ._surface_faults import surface_faults
 _RESOLUTION = 128
 # Penetration is measured in every fifth frame: it takes longer than all other metrics.
 _PENETRATION_STRIDE = 5
-_LOOK_STRIDE = 15
 
 
 @dataclasses.dataclass(frozen=True)
@@ -236,10 +236,10 @@ class _ReferenceTables:
         free = inside.cloth_inside & ~inside.pinched
         faces = np.asarray(assembly.faces)
         strain, wanted = (edge_strain(assembly, p) for p in (x, y))
-        looked = np.flatnonzero(finite)[::_LOOK_STRIDE]
-        spectrum = fold_spectrum(assembly.rest, faces, x[::_LOOK_STRIDE])
+        looked = np.flatnonzero(finite)[::LOOK_STRIDE]
+        spectrum = fold_spectrum(assembly.rest, faces, x[::LOOK_STRIDE])
         if (sequence.name, name) not in self._spectra:
-            shape = fold_spectrum(assembly.rest, faces, reference[::_LOOK_STRIDE])
+            shape = fold_spectrum(assembly.rest, faces, reference[::LOOK_STRIDE])
             self._spectra[sequence.name, name] = shape
         angles = [dihedral_angles(faces, p) for p in (x, y)]
         values |= {

@@ -17,8 +17,8 @@ from ._motion_metrics import (
 )
 from ._strain import edge_strain
 
-# Every so manieth frame is looked at for the spectrum.
-_STRIDE = 15
+LOOK_STRIDE = 15
+"""Every so manieth frame is looked at where a look takes long."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,9 @@ def likeness(
     def tension(x: np.ndarray) -> float:
         return float(np.quantile(edge_strain(assembly, x), 0.99))
 
-    found, wanted = (fold_spectrum(assembly.rest, faces, x[::_STRIDE]) for x in (cloth, reference))
+    found, wanted = (
+        fold_spectrum(assembly.rest, faces, x[::LOOK_STRIDE]) for x in (cloth, reference)
+    )
     return Likeness(
         rmse_mm=vertex_error(cloth, reference).rmse_mm,
         folds=_ratio(fold_strength(faces, cloth), fold_strength(faces, reference)),

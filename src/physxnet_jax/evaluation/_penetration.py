@@ -18,8 +18,9 @@ from ..geometry import (
     vertex_faces,
     vertex_normals,
 )
-from ..motion import Motion, animate
+from ..motion import Motion
 from ..simulation import Assembly
+from ._skin import animated_skin
 
 # Largest distance at rest between skin and the cloth that covers it [m].
 _MAX_CLOTH_DISTANCE = 0.08
@@ -83,19 +84,7 @@ def penetration(
     looked = np.arange(len(positions)) if frames is None else np.asarray(frames)
     body = assembly.body
     faces = np.asarray(triangulate(body.quads))
-    rest = jnp.asarray(assembly.rest_body, jnp.float32)
-    part = Motion(
-        jnp.asarray(motion.rotations)[looked], jnp.asarray(motion.root)[looked], motion.fps
-    )
-    skin = np.asarray(
-        animate(
-            body,
-            rest,
-            rest[:NUM_BODY_VERTICES],
-            jnp.asarray(body.weights[:NUM_BODY_VERTICES]),
-            part,
-        )
-    )
+    skin = animated_skin(assembly, motion, looked)
     rest_skin = assembly.rest_body[:NUM_BODY_VERTICES]
     rest_nearest = _nearest(rest_skin, assembly.rest)
     build = _SkinTopology(

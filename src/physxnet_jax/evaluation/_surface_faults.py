@@ -16,8 +16,9 @@ from ..geometry import (
     vertex_normals,
     visible_skin,
 )
-from ..motion import Motion, animate
+from ..motion import Motion
 from ..simulation import Assembly
+from ._skin import animated_skin
 
 # Skin below cloth at rest, as far away as this along its normal, is covered [m].
 _COVER = 0.3
@@ -63,14 +64,8 @@ def surface_faults(
         Shares over these frames.
     """
     looked = np.arange(len(positions)) if frames is None else np.asarray(frames)
-    body = assembly.body
-    faces = np.asarray(triangulate(body.quads))
-    rest = jnp.asarray(assembly.rest_body, jnp.float32)
-    part = Motion(
-        jnp.asarray(motion.rotations)[looked], jnp.asarray(motion.root)[looked], motion.fps
-    )
-    weights = jnp.asarray(body.weights[:NUM_BODY_VERTICES])
-    skin = np.asarray(animate(body, rest, rest[:NUM_BODY_VERTICES], weights, part))
+    faces = np.asarray(triangulate(assembly.body.quads))
+    skin = animated_skin(assembly, motion, looked)
     counted = _covered_faces(
         assembly.rest_body[:NUM_BODY_VERTICES], faces, assembly.rest, assembly.faces
     )

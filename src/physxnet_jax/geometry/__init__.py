@@ -6,6 +6,7 @@ from ._candidates import nearby_faces as nearby_faces, spread_points as spread_p
 from ._closest import (
     closest_among as closest_among,
     closest_barycentric as closest_barycentric,
+    closest_on_host as closest_on_host,
     closest_points as closest_points,
     fast_argmin as fast_argmin,
     nearest_distinct as nearest_distinct,

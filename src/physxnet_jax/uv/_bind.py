@@ -13,7 +13,7 @@ from ..geometry import (
     TriMesh,
     cast_rays,
     cast_rays_within,
-    closest_among,
+    closest_on_host,
     nearby_faces,
     padded_rows,
     vertex_normals,
@@ -248,11 +248,7 @@ def _closest(
     near = nearby_faces(np.asarray(mesh.vertices), np.asarray(mesh.faces), points, neighbours=12)
     # Of faces that share the closest point, the first counts.
     near = np.sort(near, axis=1)
-    padded = jnp.asarray(padded_rows(points)), jnp.asarray(padded_rows(near))
-    found = closest_among(mesh, *padded)
-    parts = (found.face, found.weights, found.squared_distance)
-    face, weights, squared = (np.asarray(x)[: len(points)] for x in parts)
-    return face, weights, squared
+    return closest_on_host(np.asarray(mesh.vertices), np.asarray(mesh.faces), points, near)
 
 
 def sampling_weights(

@@ -13,8 +13,7 @@ from ...body import NUM_BODY_VERTICES
 from ...garment import Garment, SkinnedGarment
 from ...geometry import (
     Smoothing,
-    TriMesh,
-    closest_among,
+    closest_on_host,
     gaussian_smoothing,
     map_frames,
     vertex_normals,
@@ -112,10 +111,11 @@ def _outward_faces(
     skin: Float[np.ndarray, "skin 3"], worn: SkinnedGarment, garment: Garment
 ) -> Int[np.ndarray, "faces 3"]:
     """Triangles of a garment, oriented outward; in some files they face inward."""
-    points, faces = np.asarray(worn.rest), np.asarray(garment.mesh.faces)
-    normals = np.asarray(vertex_normals(jnp.asarray(points), jnp.asarray(faces)))
-    out = points - skin[KDTree(skin).query(points)[1]]
-    return faces[:, ::-1] if np.sum(normals * out) < 0.0 else faces
+    faces = np.asarray(garment.mesh.faces)
+    a, b, c = np.moveaxis(np.asarray(worn.rest)[faces], 1, 0)
+    middles = (a + b + c) / 3.0
+    out = middles - skin[KDTree(skin).query(middles)[1]]
+    return faces[:, ::-1] if np.sum(np.cross(b - a, c - a) * out) < 0.0 else faces
 
 
 def _make_layer(
@@ -130,9 +130,8 @@ def _make_layer(
     k = min(_NUM_CANDIDATES // 2 if under else _NUM_CANDIDATES, len(faces))
     near = KDTree(other[faces].mean(axis=1)).query(points, k=k)[1].reshape(len(points), k)
     # A large triangle may be near although its centroid is far away.
-    mesh = TriMesh(jnp.asarray(other), jnp.asarray(faces))
-    hit = closest_among(mesh, jnp.asarray(points), jnp.asarray(near.astype(np.int32)))
-    rows = np.flatnonzero(np.asarray(hit.squared_distance) < _MAX_DISTANCE**2)
+    squared = closest_on_host(other, faces, points, near)[2]
+    rows = np.flatnonzero(squared < _MAX_DISTANCE**2)
     least = (
         np.full(len(points), _PRESS_CLEARANCE, np.float32)
         if under
