@@ -18,7 +18,7 @@ from ._topology import mesh_edges
 
 _A = TypeVar("_A", Array, np.ndarray)
 _FACE_CHUNK = 256
-_POINT_CHUNK = 4096
+_POINT_CHUNK = 256
 # Derivatives of a quotient contain the inverse square of its denominator, which overflows
 # float32 below this value. Edges so short count as points, triangles so thin as lines.
 _MIN_SQUARE = 1e-18
