@@ -78,7 +78,7 @@ class GuidedScene:
     solver: Solver = dataclasses.field(metadata={"static": True})
     order: tuple[int, ...] = dataclasses.field(metadata={"static": True})
     parts: tuple[int, ...] = dataclasses.field(metadata={"static": True})
-    strain: StrainLimits | None
+    strain: StrainLimits
     colliders: tuple[BodyCollider, ...] | None
     layers: tuple[Layer, ...] | None
 
@@ -155,6 +155,8 @@ def prepare_guided(
     ]
     # Effects that are given are taken as they are.
     contact = _contact(len(outfit.garments)) if simulation.effects is None else ()
+    strain = prepare_strain(outfit, Inference(strain_iterations=_STRAIN))
+    assert strain is not None
     scene = build_scene(outfit.garments, outfit.body, shape, simulation, (*guide, *contact))
     places = {id(g): k for k, g in enumerate(outfit.garments)}
     prepared = prepare_scene(scene)
@@ -164,7 +166,7 @@ def prepare_guided(
         solver=solver,
         order=tuple(places[id(g)] for g in scene.garments),
         parts=prepared.assembly.parts,
-        strain=prepare_strain(outfit, Inference(strain_iterations=_STRAIN)),
+        strain=strain,
         colliders=prepare_collisions(outfit, Inference()),
         layers=prepare_layers(outfit, Inference()),
     )
@@ -187,7 +189,7 @@ def reshape_guided(
     cloth = scene.joined(tuple(w.rest for w in worn))[:, :, 0]
     return dataclasses.replace(
         scene.with_system(scene.system.reshaped(cloth, rest)),
-        strain=scene.strain and reshape_strain(scene.strain, worn),
+        strain=reshape_strain(scene.strain, worn),
         colliders=scene.colliders and reshape_colliders(scene.colliders, body, rest),
     )
 
@@ -295,6 +297,10 @@ def advance_guided(
             diagnose=False,
         )[0]
 
+    def drawn(x: Array) -> Array:
+        """Cloth moved so that its patches lie where they are predicted."""
+        return x + scene.guide.spread(means - scene.guide.means(x))
+
     def start(_: None) -> State:
         # Skinned cloth, whose patches lie where they are predicted: a prediction's own hems are
         # ragged. As fast as its skinning.
@@ -302,13 +308,14 @@ def advance_guided(
             scene.joined(tuple(skin_garment(w, r, t) for w in worn))
             for r, t in ((rotations, translations), (state.rotations, state.translations))
         )
-        place = skinned + scene.guide.spread(means - scene.guide.means(skinned))
+        at = rotations[None], translations[None]
+        place = drawn(skinned)
         # Without slits where legs tear skinned cloth apart, and outside the skin: what begins
         # within shows for many frames.
         cloth = tuple(x[None] for x in scene.parted(place))
-        at = rotations[None], translations[None]
-        if scene.strain is not None:
-            cloth = apply_strain(scene.strain, cloth, *at)
+        cloth = apply_strain(scene.strain, cloth, *at)
+        place = drawn(scene.joined(tuple(x[0] for x in cloth)))
+        cloth = tuple(x[None] for x in scene.parted(place))
         cloth = apply_contacts(scene.colliders, scene.layers, cloth, *at)
         place = scene.joined(tuple(x[0] for x in cloth))
         begun = start_state(system, place, fps * (skinned - before), solver=solver, fps=fps)

@@ -198,15 +198,13 @@ def closest_on_host(
         The closest face of each point, its weights there and the squared distance [m^2].
     """
     found = []
-    for at in range(0, len(points), _POINT_CHUNK):
+    for at in range(0, max(len(points), 1), _POINT_CHUNK):
         near = candidates[at : at + _POINT_CHUNK]
         a, b, c = np.moveaxis(vertices[faces[near]], (2, 3), (0, 1))
         p = np.broadcast_to(points[at : at + _POINT_CHUNK].T[:, :, None], a.shape)
         weights, squared = (np.asarray(x) for x in closest_barycentric(p, a, b, c))
         row, best = np.arange(len(near)), np.argmin(squared, axis=1)
         found.append((near[row, best], weights[:, row, best].T, squared[row, best]))
-    if not found:
-        return candidates[:, 0], np.zeros((0, 3), points.dtype), np.zeros(0, points.dtype)
     face, weights, squared = (np.concatenate(x) for x in zip(*found, strict=True))
     return face, weights, squared
 
