@@ -271,13 +271,8 @@ def test_maps_display_velocity_and_acceleration():
     assert maps["top"].shape == (64, 64, 3)
 
 
-def apart(x, y):
-    """Distance of nine coordinates in ten [m]: contact decides the rest by the last bits."""
-    return float(np.quantile(np.abs(x - y), 0.9))
-
-
 @pytest.mark.release
-def test_live_cloth_matches_the_clip_from_any_frame(viewer):
+def test_live_cloth_matches_the_clip_from_any_frame(viewer, apart):
     nano = Inference(weights="nano")
     choice = Choice(
         "walk", ("bottom",), method="network", inference=nano, frames=12, fps=30.0, live=True
@@ -296,8 +291,8 @@ def test_live_cloth_matches_the_clip_from_any_frame(viewer):
     for frame in (0, 1, 2):
         live = guided.live.frame(frame)["bottom"]
         assert apart(live, clip[frame]) < 2e-4, frame
-    anew = guided.live.frame(9)["bottom"]
-    assert np.isfinite(anew).all() and apart(anew, clip[9]) > 4e-4
+        assert apart(live, clip[frame + 1]) > 2e-3, "the control: the frame after"
+    assert np.isfinite(guided.live.frame(9)["bottom"]).all()
     # What only the network can answer isn't asked of skinning.
     assert run_job(dataclasses.replace(SHORT, live=True)).live is None
 
