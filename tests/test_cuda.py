@@ -11,18 +11,20 @@ import sys
 import numpy as np
 import pytest
 
+from physxnet_jax.data import load_action, read_protocol
+
 ROOT = pathlib.Path(__file__).parents[1]
 CUDA = ROOT / "experiments/cuda"
 
 
-def run(folder, *words):
+def run(folder, *words, seconds=560):
     env = {"OUT": folder / "out", "WORK": folder / "work", "PACK": folder, "PYTHON": sys.executable}
     return subprocess.run(
-        ["bash", str(CUDA / "run.sh"), "--toy", *words],
+        ["bash", str(CUDA / "run.sh"), *words, "--toy"],
         env=os.environ | {k: str(v) for k, v in env.items()} | {"JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,
-        timeout=560,
+        timeout=seconds,
     )
 
 
@@ -32,7 +34,7 @@ def test_every_part_measures_at_the_smallest_size(tmp_path):
     done = run(tmp_path)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
     parts = json.loads((tmp_path / "out/results.json").read_text())
-    assert set(parts) == {"tests", "simulator", "network", "dataset", "paper", "base"}
+    assert set(parts) == {"tests", "simulator", "network"}
     fast = parts["tests"][1]
     assert fast["finished"] and fast["passed"] > 0 and not fast["failed"]
     for row in parts["simulator"][1:]:
@@ -40,20 +42,30 @@ def test_every_part_measures_at_the_smallest_size(tmp_path):
         assert row["rms_from_reference_mm"] < 1.0
     precisions = [r["rms_mm"] for r in parts["network"][:2]]
     assert precisions[0] < 1e-3 < precisions[1] < 1.0
-    totals = [r for r in parts["dataset"] if r["what"].startswith("all of")]
-    assert len(totals) == 2 and not any(r["unusable"] for r in totals)
-    for name in ("paper", "base"):
-        assert any("validation_mm" in r for r in parts[name])
-        assert (tmp_path / f"out/{name}-weights.tar.gz.0").stat().st_size < 16e6
-    assert len([p for p in (tmp_path / "out").rglob("*") if p.is_file()]) <= 8
     assert "part " in done.stdout.splitlines()[-sum(len(rows) for rows in parts.values()) - 1]
 
 
+@pytest.mark.nightly
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_networks_are_learned_from_data_made_there(tmp_path):
+    # Long enough for two cores; the smallest runs end when their steps are done.
+    done = run(tmp_path, "learn", "--seconds", "1500", seconds=1560)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-1000:]
+    rows = json.loads((tmp_path / "out/learned.json").read_text())
+    assert rows["clothes-0"][0]["people"] == 12 and rows["clothes-0"][0]["came_off"] == 0
+    assert any("validation_mm" in r for r in rows["paper"])
+    for name in ("paper", "small", "nano"):
+        assert rows[name][-1]["what"] == "run" and rows[name][-1]["steps"] > 0
+        assert (tmp_path / f"out/{name}.tar.gz.0").stat().st_size < 16e6
+    assert len([p for p in (tmp_path / "out").rglob("*") if p.is_file()]) <= 8
+
+
 @pytest.mark.release
-def test_part_without_data_fails_and_others_keep_their_rows(tmp_path):
-    done = run(tmp_path, "tests", "paper")
-    assert done.returncode != 0 and "not finished: paper" in done.stdout
-    assert set(json.loads((tmp_path / "out/results.json").read_text())) == {"tests"}
+def test_part_that_fails_is_named_and_others_keep_their_rows(tmp_path, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_no_such_flag")
+    done = run(tmp_path, "simulator")
+    assert done.returncode != 0 and "not finished: simulator" in done.stdout
+    assert not (tmp_path / "out/results.json").is_file()
 
 
 def test_work_counts_loops_and_products():
@@ -74,17 +86,25 @@ def test_work_counts_loops_and_products():
     assert ceilings.seconds(floor["Work"](2e9, 1e9)) == pytest.approx(2.0)
 
 
-def test_motions_are_packed_byte_for_byte(tmp_path, data_dir, monkeypatch):
+@pytest.mark.release
+def test_packed_motions_are_the_actions(tmp_path, data_dir, monkeypatch):
     monkeypatch.syspath_prepend(str(CUDA))
     pack = runpy.run_path(str(CUDA / "pack.py"))
     mocap = data_dir / "mocap"
     pack["pack_motions"](mocap, tmp_path / "a.npz")
     assert (tmp_path / "a.npz").stat().st_size < 16e6
     pack["unpack_motions"](tmp_path / "a.npz", tmp_path / "b")
-    files = [p for p in (tmp_path / "b").rglob("*") if p.is_file()]
-    assert len(files) > 20
-    for path in files:
-        assert path.read_bytes() == (mocap / path.relative_to(tmp_path / "b")).read_bytes()
+    packed = read_protocol(tmp_path / "b/actions")
+    wanted = [a for a in read_protocol(mocap) if a.split != "test"]
+    assert [(a.name, a.split, a.frames) for a in packed] == [
+        (a.name, a.split, a.frames) for a in wanted
+    ]
+    for a, b in list(zip(packed, wanted, strict=True))[::6]:
+        got, motion = load_action(tmp_path / "b/actions", a), load_action(mocap, b)
+        np.testing.assert_allclose(got.root, motion.root, atol=1e-5)
+        np.testing.assert_allclose(np.abs(got.rotations), np.abs(motion.rotations), atol=1e-5)
+    left = read_protocol(tmp_path / "b/left")
+    assert {a.name for a in left} < {a.name for a in packed} and len(left) > 5
     np.savez(tmp_path / "c.npz", **{"../d": np.zeros(3, np.uint8)})
     with pytest.raises(ValueError, match="out of the folder"):
         pack["unpack_motions"](tmp_path / "c.npz", tmp_path / "e")

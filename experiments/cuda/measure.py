@@ -1,20 +1,15 @@
 """What waits for a CUDA machine, part by part, each within its own time.
 
-Command: bash experiments/cuda/run.sh [tests simulator network dataset paper base] [--toy]
-Cost:    under 9 minutes on an H100 or H200 (--seconds); with --toy a few on two cores.
-Result:  $OUT/results.json, by part; the weights of the last two parts in pieces under 16 MB.
-         The table comes last. A part that ends early keeps its rows.
+Command: bash experiments/cuda/run.sh [tests simulator network] [--toy]
+Cost:    under 6 minutes on an H100 or H200 (--seconds); with --toy a few on two cores.
+Result:  $OUT/results.json, by part. The table comes last. A part that ends early keeps its rows.
 
     tests      versions, and the package's fast tests that need no file
     simulator  ms a person and frame, next to the error, and to the arithmetic floor
     network    ms a frame of network and pipeline, live and batched, and the error of precisions
-    dataset    the protocol's training actions in fitted garments and in clothes with ease
-    paper      the paper's network at full size, from the former
-    base       the default network, wider, from the latter
 """
 
 import argparse
-import csv
 import dataclasses
 import faulthandler
 import importlib.metadata
@@ -33,26 +28,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from floor import Ceilings, measure_ceilings, work_of
-from pack import unpack_motions
 from rich.console import Console
 
 import physxnet_jax as px
-from physxnet_jax.cli._configs import read_config
-from physxnet_jax.data import (
-    DatasetConfig,
-    build_dataset,
-    dataset_digest,
-    list_sequences,
-    read_sequence,
-    read_times,
-    usable_garment,
-)
 from physxnet_jax.dressing import Inference, clothe, make_dresser
-from physxnet_jax.errors import FormatError
 from physxnet_jax.evaluation import evaluated_errors, machine, network_costs
 from physxnet_jax.files import write_json
-from physxnet_jax.models import save_predictor
-from physxnet_jax.motion import Motion, save_motion
+from physxnet_jax.motion import Motion
 from physxnet_jax.simulation import (
     PRESETS,
     ROLLOUT_BLOCK,
@@ -66,7 +48,6 @@ from physxnet_jax.simulation import (
     start_state,
     warmup,
 )
-from physxnet_jax.training import TrainConfig, read_metrics, train
 
 HERE = pathlib.Path(__file__).parent
 ROOT = HERE.parent.parent
@@ -78,9 +59,6 @@ LIMITS = {
     "tests": 75,
     "simulator": 130,
     "network": 110,
-    "dataset": 240,
-    "paper": 240,
-    "base": 240,
 }
 # Left for the table and the last writes [s].
 _RESERVE = 10
@@ -292,171 +270,10 @@ def network(record: Record, toy: bool, until: float) -> None:
                 )
 
 
-def _motions(toy: bool) -> pathlib.Path:
-    folder = WORK / "mocap"
-    if toy:
-        folder.mkdir(parents=True, exist_ok=True)
-        (clip,) = _people(1, 24)
-        save_motion(folder / "punch.npz", clip)
-        with (folder / "ACTIONS.csv").open("w", newline="") as file:
-            table = csv.writer(file)
-            table.writerow(["split", "action", "file", "start_s", "frames_at_30fps"])
-            table.writerow(["train", "punch", "punch.npz", 0.0, 12])
-            table.writerow(["train", "kick ball", "punch.npz", 0.4, 10])
-    elif not folder.is_dir():
-        unpack_motions(PACK / "mocap.npz", folder)
-    return folder
-
-
-def _preset_that_fits(seconds: float, frames: int, garments: int, people: int) -> str:
-    """The finest preset whose measured time allows it."""
-    rows = [r for r in read_results().get("simulator", []) if r.get("people", 0) >= people]
-    for preset in ("reference", "standard"):
-        measured = [r["ms_per_person_frame"] * r["people"] for r in rows if r["preset"] == preset]
-        if measured and 1e-3 * measured[0] * frames * garments < 0.8 * seconds:
-            return preset
-    return "standard" if rows else "reference"
-
-
-def dataset(record: Record, toy: bool, until: float) -> None:
-    folder = _motions(toy)
-    # Clothes first: at `standard` they take a share of what fitted garments take at `reference`.
-    for table in ("cuda_default", "cuda"):
-        config = read_config(str(ROOT / f"experiments/datasets.toml#{table}"), DatasetConfig)
-        preset = "standard"
-        if toy:
-            preset, config = "toy", dataclasses.replace(config, people=2, solver=XPBD(8, 1))
-            if config.outfits:
-                config = dataclasses.replace(config, outfits=config.outfits[:1], outfits_each=1)
-            else:
-                config = dataclasses.replace(config, templates=("bottom",))
-        elif table == "cuda":
-            preset = _preset_that_fits(until - time.monotonic(), 240, 3, 16)
-            config = dataclasses.replace(config, solver=PRESETS[preset])
-        _build(record, table, config, preset, folder)
-
-
-def _build(
-    record: Record, table: str, config: DatasetConfig, preset: str, folder: pathlib.Path
-) -> None:
-    """Builds a dataset and records what each of its garments took."""
-    place, began = WORK / table, time.perf_counter()
-    build_dataset(config, place, folder, report=lambda text, k, n: say(f"  {k} of {n}: {text}"))
-    lines = read_times(place)
-    sequences = [read_sequence(f) for f in list_sequences(place)]
-    bad = sum(not usable_garment(m) for s in sequences for m in s.meta.values())
-    digest, size = dataset_digest(place)
-    for name in dict.fromkeys(x["template"] for x in lines):
-        mine = [x for x in lines if x["template"] == name]
-        seconds, frames = (sum(x[k] for x in mine) for k in ("seconds", "frames"))
-        record.add(
-            f"{name}, {preset}",
-            preset=preset,
-            seconds=seconds,
-            frames=frames,
-            garment_frames_per_s=frames / max(seconds, 1e-9),
-        )
-    record.add(
-        f"all of {table}",
-        preset=preset,
-        seconds=time.perf_counter() - began,
-        megabytes=size / 1e6,
-        unusable=bad,
-        sha256=digest,
-    )
-
-
-def _train(name: str, table: str, record: Record, toy: bool, until: float) -> None:
-    config = read_config(str(ROOT / f"experiments/training.toml#{name}-cuda"), TrainConfig)
-    sequences = [read_sequence(f) for f in list_sequences(WORK / table, "train")]
-    # Of a dataset that was cut, what is there. A person in an outfit wears a garment or two.
-    worn = [set(s.offsets) for s in sequences]
-    join = set.union if config.model.conditions else set.intersection
-    stored = join(*worn) if worn else set()
-    templates = tuple(t for t in config.model.templates if t in stored)
-    if not templates:
-        raise FormatError(f"{WORK / table}: no garment is complete; give `dataset` more time.")
-    config = dataclasses.replace(
-        config, model=dataclasses.replace(config.model, templates=templates)
-    )
-    if toy:
-        size = 64 if config.model.finer else 32
-        model = dataclasses.replace(config.model, resolution=size, width=4)
-        config = dataclasses.replace(config, model=model, batch=4)
-    began = time.perf_counter()
-    trial = WORK / f"{name}-trial"
-    shutil.rmtree(trial, ignore_errors=True)
-    steps = 25 if toy else 80
-    train(
-        dataclasses.replace(config, validate_every=10**6, epochs=10**3),
-        sequences,
-        trial,
-        steps=steps,
-    )
-    spent = time.perf_counter() - began
-    laps = read_metrics(trial)
-    step_s = (laps[-1]["seconds"] - laps[-2]["seconds"]) / (laps[-1]["step"] - laps[-2]["step"])
-    used = [s for s in sequences if s.motion.name not in config.validation]
-    # A step takes a batch of each template.
-    frames = max(sum(s.motion.num_frames for s in used if t in s.offsets) for t in templates)
-    frames *= 2 if config.mirror_augmentation else 1
-    epoch = max(frames // config.batch, 1)
-    record.add(
-        "trial",
-        templates=" ".join(templates),
-        resolution=config.model.resolution,
-        width=config.model.width,
-        batch=config.batch,
-        precision=config.precision,
-        ms_per_step=1e3 * step_s,
-        steps_per_epoch=epoch,
-        seconds=spent,
-    )
-    # Loading again costs about what the trial cost; validation and checkpoints a fifth.
-    left = until - time.monotonic() - spent - 15.0
-    epochs = 1 if toy else max(int(left / (1.2 * step_s * epoch)), 1)
-    final = dataclasses.replace(config, epochs=min(epochs, config.epochs), validate_every=epoch)
-    run = WORK / name
-    shutil.rmtree(run, ignore_errors=True)
-    began = time.perf_counter()
-
-    def report(done: int, total: int, values: dict[str, float]) -> None:
-        if "validation_mm" in values:
-            record.add(
-                f"epoch {done // epoch} of {final.epochs}",
-                step=done,
-                seconds=time.perf_counter() - began,
-                **{k: float(v) for k, v in values.items() if k.startswith("validation")},
-            )
-
-    predictor = train(final, sequences, run, report=report)
-    record.add("run", epochs=final.epochs, seconds=time.perf_counter() - began, peak_mb=_peak_mb())
-    weights = WORK / f"{name}-weights"
-    save_predictor(weights, predictor, name=f"{name}-cuda")
-    shutil.make_archive(str(WORK / f"{name}-weights"), "gztar", weights)
-    packed = (WORK / f"{name}-weights.tar.gz").read_bytes()
-    pieces = [packed[k : k + _PIECE] for k in range(0, len(packed), _PIECE)]
-    # With the log, the results and the tests' output, at most eight files come back.
-    for k, piece in enumerate(pieces if len(pieces) <= 2 else []):
-        (OUT / f"{name}-weights.tar.gz.{k}").write_bytes(piece)
-    record.add("weights", megabytes=len(packed) / 1e6, pieces=len(pieces))
-
-
-def paper(record: Record, toy: bool, until: float) -> None:
-    _train("paper", "cuda", record, toy, until)
-
-
-def base(record: Record, toy: bool, until: float) -> None:
-    _train("base", "cuda_default", record, toy, until)
-
-
 PARTS: dict[str, Callable[[Record, bool, float], None]] = {
     "tests": tests,
     "simulator": simulator,
     "network": network,
-    "dataset": dataset,
-    "paper": paper,
-    "base": base,
 }
 
 

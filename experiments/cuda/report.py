@@ -54,7 +54,10 @@ def main() -> int:
     options = parser.parse_args()
     path = RESULTS / "cuda.json"
     stored = json.loads(path.read_text()) if path.is_file() else {}
-    found = json.loads((options.folder / "results.json").read_text())
+    found = {}
+    for name in ("results.json", "learned.json"):
+        if (options.folder / name).is_file():
+            found |= json.loads((options.folder / name).read_text())
     parts = merged(stored, found, options.date)
     write_json(path, parts)
     with atomic_write(RESULTS / "cuda.md") as part:

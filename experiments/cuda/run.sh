@@ -1,10 +1,11 @@
 #!/usr/bin/env bash
-# Everything that waits for a CUDA machine, within 9 minutes and without a network:
+# Everything that waits for a CUDA machine, without a network:
 #
 #   python experiments/cuda/pack.py           where the motions and a package registry are
-#   bash experiments/cuda/run.sh [PART ...]   there; out/cuda travels with the tracked files
+#   bash experiments/cuda/run.sh [PART ...]   there: what is measured (measure.py)
+#   bash experiments/cuda/run.sh learn        there: networks from data made there (learn.py)
 #
-# Results: $OUT (out/cuda/results by default): results.json, log.txt and the weights.
+# out/cuda travels with the tracked files. Results: $OUT (out/cuda/results by default).
 set -euo pipefail
 cd "$(dirname "$0")/../.."
 export PACK="${PACK:-out/cuda}" OUT="${OUT:-out/cuda/results}"
@@ -17,4 +18,9 @@ if compgen -G "$PACK/wheels/*.whl" > /dev/null; then
   export PYTHONPATH="$site"
 fi
 export PYTHONPATH="src${PYTHONPATH:+:$PYTHONPATH}"
-"$python" experiments/cuda/measure.py "$@" 2>&1 | tee "$OUT/log.txt"
+script=measure
+if [[ "${1:-}" == learn ]]; then
+  script=learn
+  shift
+fi
+"$python" "experiments/cuda/$script.py" "$@" 2>&1 | tee "$OUT/$script.txt"

@@ -420,10 +420,13 @@ def test_shards_partition_the_actions(data_dir, tmp_path, monkeypatch):
     monkeypatch.setattr(_build, "_simulate", note)
     config = DatasetConfig(splits=("train",), templates=("bottom",))
     names = [a.name for a in read_protocol(data_dir / "mocap") if a.split == "train"]
+    parts = []
     for k in range(3):
         done.clear()
         count = build_dataset(config, tmp_path, data_dir / "mocap", shard=(k, 3))
-        assert done == names[k::3] and count == len(done) > 5
+        assert count == len(done) > 5
+        parts += done
+    assert parts == names
     # Side by side: of similar length, all of them once.
     done.clear()
     grouped = dataclasses.replace(config, people=4)

@@ -113,7 +113,7 @@ class Dataset:
     """build: use a Ray cluster: its address, or none for one on this machine. All its machines need
     to see --out and --mocap."""
     shard: str = "0/1"
-    """build: i/n, every n-th group of actions from the i-th."""
+    """build: i/n, the i-th of n equal parts of the jobs, counted from 0."""
     only: tuple[str, ...] = ()
     """build: names of the actions to build; all by default."""
     contact_sheet: pathlib.Path | None = None

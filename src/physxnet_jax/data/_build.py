@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import functools
+import itertools
 import math
 import pathlib
 import time
@@ -76,8 +77,7 @@ def build_dataset(
         config: Settings of the dataset.
         root: Folder of the dataset, or a URL that tensorstore takes.
         folder: Folder with the motion files and ``ACTIONS.csv``.
-        shard: ``(i, n)``: every n-th action (or group of actions, see `DatasetConfig.people`),
-            starting with the i-th.
+        shard: ``(i, n)``: the i-th of n equal parts of the jobs, counted from 0.
         only: Names of the actions to build; all of them if empty.
         report: Callback that takes a message, the jobs done and the total number of jobs.
         ray: Address of a Ray cluster whose machines all see ``root`` and ``folder``, or ``local``;
@@ -141,9 +141,15 @@ def _build(
     # A group for each device; a job on a cluster has one.
     width = len(jax.local_devices()) if ray is None and config.engine == "physxnet" else 1
     jobs, count = [], 0
-    for clothes in _all_clothes(config):
-        own_groups = _groups(config, _wearing(config, clothes, everyone, actions))
-        own_groups = own_groups[shard[0] :: shard[1]]
+    planned = [
+        (clothes, group)
+        for clothes in _all_clothes(config)
+        for group in _groups(config, _wearing(config, clothes, everyone, actions))
+    ]
+    # In one piece, so that few clothes are prepared by several shards.
+    first, end = (-(-len(planned) * k // shard[1]) for k in (shard[0], shard[0] + 1))
+    for clothes, own in itertools.groupby(planned[first:end], key=lambda p: p[0]):
+        own_groups = [group for _, group in own]
         stored = {a: clothes.is_stored(root, a) for g in own_groups for a in g}
         count += sum(not s for s in stored.values())
         missing = [g for g in own_groups if not all(stored[a] for a in g)]

@@ -1,5 +1,6 @@
 """Batches in which every template has samples of its own."""
 
+import concurrent.futures
 import dataclasses
 from collections.abc import Iterator, Mapping
 
@@ -50,8 +51,10 @@ class TemplateStreams:
         return max(s.steps_per_epoch for s in self.streams.values())
 
     def first(self) -> dict[str, Frames]:
-        """Each template's first group of frames."""
-        return {t: s.first() for t, s in self.streams.items()}
+        """Each template's first group of frames, read side by side."""
+        with concurrent.futures.ThreadPoolExecutor(len(self.streams)) as pool:
+            found = {t: pool.submit(s.first) for t, s in self.streams.items()}
+            return {t: f.result() for t, f in found.items()}
 
     def batches(self, start: int, rows: slice) -> Batches:
         """Batches from a step on; of each the rows that this process needs."""

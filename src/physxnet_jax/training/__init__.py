@@ -2,6 +2,7 @@
 
 from ._checkpoint import Checkpoints as Checkpoints
 from ._config import TrainConfig as TrainConfig
+from ._data import TrainingData as TrainingData, load_data as load_data
 from ._loop import train as train
 from ._losses import (
     adversarial_loss as adversarial_loss,

@@ -48,7 +48,7 @@ def _going_on(data: TrainingData, before: Predictor) -> TrainingData:
 @claims("folder", unless=jax.process_index)
 def train(
     config: TrainConfig,
-    sequences: Items[Sequence | Where | Entry],
+    sequences: Items[Sequence | Where | Entry] | TrainingData,
     folder: str | pathlib.Path,
     *,
     network: nnx.Module | None = None,
@@ -64,6 +64,7 @@ def train(
         config: Settings of the run.
         sequences: Simulated actions, including those of ``config.validation``: their entries from
             `list_entries` or folders, which are read while others are learned from, or the actions.
+            Or what `load_data` made of them, for several runs on the same data.
         folder: Folder for checkpoints and ``metrics.jsonl``.
         network: Any module with the signature of `Generator`; a `Generator` by default.
         loss: Any function of `LossInputs`; `configured_loss` by default.
@@ -90,7 +91,7 @@ def train(
     before = load_predictor(config.start) if config.start else None
     if before is not None and (before.config != config.model or network is not None):
         raise PhysXNetError(f"start: {config.start} is another model than that of the run.")
-    data = load_data(config, sequences)
+    data = sequences if isinstance(sequences, TrainingData) else load_data(config, sequences)
     identity = data.frames.identity
     if before is not None:
         data = _going_on(data, before)
