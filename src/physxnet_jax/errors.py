@@ -110,6 +110,19 @@ def check_counts(owner: object, *names: str) -> None:
             raise ValueError(f"{name} is {value}, expected a whole number of at least 1")
 
 
+def check_type(value: object, kinds: type | tuple[type, ...], advice: str) -> None:
+    """Raises an error that says what to pass unless a value is of one of some types.
+
+    Args:
+        value: The value.
+        kinds: The types.
+        advice: What to pass, as a sentence.
+    """
+    if not isinstance(value, kinds):
+        shown = f"'{value}'" if isinstance(value, str) else f"an object of {type(value).__name__}"
+        raise PhysXNetError(f"This is {shown}. {advice}")
+
+
 __all__ = [
     "BrokenInstallError",
     "BusyError",
@@ -124,5 +137,6 @@ __all__ = [
     "WeightsError",
     "check_counts",
     "check_numbers",
+    "check_type",
     "visible",
 ]

@@ -70,6 +70,7 @@ def bare(self, displacement, context):
 FAULTS = {
     "gravity is a tenth stronger": (_gravity._Gravity, "accelerate", heavier),
     "the skin isn't in the way": (_contact._Contact, "project", idle),
+    "deep cloth is above any skin": (_contact._Contact, "raised", lambda _, points, *__: points),
     "contact moves what doesn't touch": (_contact._Contact, "project", nudging),
     "garments pass through each other": (_layers._Layers, "project", idle),
     "cloth passes through itself": (_pairs.ClothContact, "project", idle),
@@ -101,6 +102,7 @@ CONTROLS = {
     "a_kilometre_from_the_origin": "springs see rounded positions",
     "ten_thousand_steps": "springs are explicit",
     "an_effect_that_touches_nothing": "contact moves what doesn't touch",
+    "start_fifty_millimetres_inside": "deep cloth is above any skin",
     "a_top_over_trousers": "garments pass through each other",
     "a_strain_limit_in_a_storm": "the limit doesn't act",
 }

@@ -15,6 +15,7 @@ from ..simulation import (
     STANDARD,
     XPBD,
     Effect,
+    PreparedScene,
     Rollout,
     Scene,
     Status,
@@ -135,10 +136,8 @@ def _body_rows(out: Rollout) -> Iterator[tuple[str, float, float]]:
     yield "deepest vertex (mm)", 2.0, 1e3 * float(d["penetration_max"].max())
 
 
-@case
-def start_ten_millimetres_inside() -> Iterator[tuple[str, float, float]]:
-    g = template("bottom")
-    scene = prepare_scene(Scene((g,), (BodyContact(), Pin())))
+def _sunk(scene: PreparedScene, depth: float) -> Float[np.ndarray, "vertices 3"]:
+    """Cloth at a depth below the skin that it lies on [m]."""
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
     mesh = body.mesh(rest[:NUM_BODY_VERTICES])
@@ -147,10 +146,27 @@ def start_ten_millimetres_inside() -> Iterator[tuple[str, float, float]]:
     tri = np.asarray(mesh.faces)[np.asarray(hit.face)]
     foot = np.einsum("vk,vkc->vc", np.asarray(hit.weights), np.asarray(mesh.vertices)[tri])
     away = (x - foot) / np.linalg.norm(x - foot, axis=1, keepdims=True)
-    out = settle_on_static_body(scene, 5, solver=XPBD(32, 4), start=foot - 0.010 * away)
+    return foot - depth * away
+
+
+@case
+def start_ten_millimetres_inside() -> Iterator[tuple[str, float, float]]:
+    scene = prepare_scene(Scene((template("bottom"),), (BodyContact(), Pin())))
+    out = settle_on_static_body(scene, 5, solver=XPBD(32, 4), start=_sunk(scene, 0.010))
     yield "frames not finite", 0, bad_frames(out)
     yield "deepest after a frame (mm)", 1.0, 1e3 * float(out.diagnostics["penetration_max"][0])
     yield "greatest speed later (m/s)", 1.5, float(out.diagnostics["speed_max"][1:].max())
+
+
+@case
+def start_fifty_millimetres_inside() -> Iterator[tuple[str, float, float]]:
+    """Deeper than the middle of an arm, whose other side is nearer."""
+    scene = prepare_scene(Scene((template("top"),)))
+    out = settle_on_static_body(scene, 10, solver=XPBD(32, 4), start=_sunk(scene, 0.050))
+    strain = np.abs(edge_strain(scene.assembly, out.positions[0][-1:]))
+    yield "frames not finite", 0, bad_frames(out)
+    yield "deepest at the end (mm)", 1.0, 1e3 * float(out.diagnostics["penetration_max"][-1])
+    yield "greatest strain at the end", 0.5, float(strain.max())
 
 
 def _late_spin() -> Motion:

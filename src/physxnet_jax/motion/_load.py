@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import Body, load_body
-from ..errors import MotionError
+from ..errors import MotionError, check_type
 from ..files import atomic_write, is_file, read_arrays
 from ..io import GLTF_FORMATS
 from ._amass import AMASS_ARRAYS, amass_clip, is_amass
@@ -116,6 +116,9 @@ def read_motion(
         body: Body of built-in clips.
         shape: Its shape parameters.
     """
+    check_type(
+        motion, (str, pathlib.PurePath), "A motion is a file, the name of a clip, or a Motion."
+    )
     for name, rate in (("fps", fps), ("source_fps", source_fps)):
         if rate is not None and not (math.isfinite(rate) and rate > 0):
             raise MotionError(f"{name} is {rate}, expected a positive number.")

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from .._environment import clear_caches_if_full
 from ..body import Body
 from ..devices import make_mesh
-from ..errors import SimulationError
+from ..errors import SimulationError, check_type
 from ..files import claims
 from ..frames import FrameStore
 from ..motion import Motion, animate, ground_point
@@ -111,6 +111,7 @@ def simulate(
         SimulationError: A frame isn't finite; the message names the frame, the vertex
             and the likely cause. Or ``accuracy`` is unknown.
     """
+    check_type(motion, Motion, "Pass a Motion, as load_motion('walk') gives.")
     if accuracy not in PRESETS:
         raise SimulationError(f"Unknown accuracy '{accuracy}'; choose {', '.join(PRESETS)}.")
     out = simulate_batch(
@@ -164,7 +165,9 @@ def simulate_batch(
     if not motions:
         raise SimulationError("No motion to simulate; pass at least one.")
     clear_caches_if_full()
-    if isinstance(scene, Scene):
+    for motion in motions:
+        check_type(motion, Motion, "Pass a Motion, as load_motion('walk') gives.")
+    if not isinstance(scene, PreparedScene):
         scene = prepare_scene(scene)
     used = min(len(jax.local_devices()), len(motions)) if devices is None else devices
     missing = -len(motions) % max(used, 1)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..devices import on_processor, prepared_on_processor
-from ..errors import SimulationError
+from ..errors import SimulationError, check_type
 from ..garment import Garment
 from ..motion import Motion
 from ._assembly import assemble, float32
@@ -153,6 +153,15 @@ def prepare_scene(scene: Scene) -> PreparedScene:
     Raises:
         SimulationError: No garment, or the same effect twice.
     """
+    check_type(scene, Scene, "Pass a Scene, as Scene((template('top'),)).")
+    garments = scene.garments
+    check_type(
+        garments, (tuple, list), "The garments of a Scene are a tuple, as (template('top'),)."
+    )
+    for garment in garments:
+        check_type(
+            garment, Garment, "Pass garments, as template('top') or load_garment('coat.obj')."
+        )
     if not scene.garments:
         raise SimulationError("A scene needs a garment; garments is empty.")
     kinds = [type(e) for e in scene.effects]

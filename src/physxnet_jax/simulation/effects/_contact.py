@@ -146,6 +146,8 @@ _COVER = 0.002
 _NEAR = 0.001
 # Skin farther than this from all cloth at rest is left out [m].
 _REACH = 0.30
+# Cloth farther below the skin than this goes back to the side on which it was [m].
+_DEEP = 0.012
 # Gap kept to the highest skin below a triangle [m].
 _CLEARANCE = 0.002
 # Distance from a triangle's middle to its corners, over the length of its edges.
@@ -297,6 +299,22 @@ class _Contact(Prepared):
         start = at, jnp.ones((), bool), jnp.zeros((), jnp.int32)
         return jax.lax.while_loop(goes_on, hop, start)[0]
 
+    def raised(
+        self,
+        points: Float[Array, "some 3 batch"],
+        posed: PosedPoints,
+        at: Int[Array, "some batch"],
+    ) -> Float[Array, "some 3 batch"]:
+        """Points deep in the body, raised above the skin that they were at: the nearest skin may
+        be that of a limb's other side."""
+        lane = jnp.arange(points.shape[2])[None]
+        there, normal = (
+            jnp.moveaxis(jax.lax.stop_gradient(v)[at, :, lane], -1, 1)
+            for v in (posed.points, posed.normals)
+        )
+        height = jnp.sum((points - there) * normal, axis=1, keepdims=True)
+        return jnp.where(height < -_DEEP, points - height * normal, points)
+
     def closest(
         self,
         points: Float[Array, "some 3 batch"],
@@ -322,7 +340,8 @@ class _Contact(Prepared):
         stop = jax.lax.stop_gradient
         points = stop(start.points)
         centre, room = state
-        centre = self.walk(stop(base[self.tight]), points, centre)
+        seen = self.raised(base[self.tight], start, centre)
+        centre = self.walk(stop(seen), points, centre)
         last = centre
         if self.loose.shape[0]:
             loose = stop(base[self.loose])
@@ -330,7 +349,8 @@ class _Contact(Prepared):
             listed = jnp.broadcast_to(listed, (*self.listed.shape, loose.shape[2]))
             there = self.walk(loose, points, pick_nearest(loose, points, listed))
             last = jnp.concatenate([centre, there])[self.order]
-        face, weights = self.closest(base, start.points, last)
+            seen = jnp.concatenate([seen, base[self.loose]])[self.order]
+        face, weights = self.closest(seen, start.points, last)
         p0, n0 = _surface(start, self.faces, face, weights)
         p1, n1 = _surface(end, self.faces, face, weights)
         lane = jnp.arange(base.shape[2])[None]
