@@ -37,7 +37,7 @@ def turned(meshes, angle):
 
 
 @pytest.mark.release
-@pytest.mark.parametrize("camera", ["three-quarter", "front", "follow", "turntable"])
+@pytest.mark.parametrize("camera", ["three-quarter", "front", "back", "follow", "turntable"])
 @pytest.mark.parametrize("size", [(160, 192), (256, 144)])
 def test_the_person_fills_the_picture(person, camera, size):
     for frame in (0, 13, 23):
@@ -71,6 +71,18 @@ def test_a_turntable_goes_around_once(person):
     way = (studio._eyes - studio._targets)[:, [0, 2]]
     angle = np.unwrap(np.arctan2(way[:, 0], way[:, 1]))
     np.testing.assert_allclose(np.diff(angle), 2 * np.pi / 24, atol=1e-6)
+
+
+def test_the_back_is_seen_from_opposite_the_front(person):
+    from physxnet_jax.viewer._studio import Studio
+
+    ways = []
+    for camera in ("front", "back"):
+        studio = Studio(person, (64, 64), camera=camera)
+        studio.close()
+        ways.append((studio._eyes - studio._targets)[:, [0, 2]])
+    front, back = (w / np.linalg.norm(w, axis=1, keepdims=True) for w in ways)
+    np.testing.assert_allclose(back, -front, atol=1e-6)
 
 
 def test_headings_follow_a_turning_person(person):

@@ -178,9 +178,9 @@ class PreviewOptions:
 
     size: tuple[int, int] = (480, 544)
     """Width and height of the preview; multiples of 16 for .mp4."""
-    camera: Literal["three-quarter", "front", "follow", "turntable"] = "three-quarter"
-    """three-quarter and front keep their direction, follow turns with the person, turntable goes
-    around once; all keep the person in the middle."""
+    camera: Literal["three-quarter", "front", "back", "follow", "turntable"] = "three-quarter"
+    """three-quarter, front and back keep their direction, follow turns with the person, turntable
+    goes around once; all keep the person in the middle."""
     background: str = "studio"
     """studio, white, grey, dark or #rrggbb."""
     strip: int = 1

@@ -64,7 +64,7 @@ def render_preview(
         meshes: Meshes to render, the person first.
         fps: Frames per second.
         size: Width and height of a frame; multiples of 16 for video.
-        camera: ``three-quarter``, ``front``, ``follow`` (turns with the person) or
+        camera: ``three-quarter``, ``front``, ``back``, ``follow`` (turns with the person) or
             ``turntable``. All keep the person in the middle.
         background: ``studio``, ``white``, ``grey``, ``dark`` or ``#rrggbb``.
         strip: Number of moments side by side in a ``.png``, spread over the clip; one is the

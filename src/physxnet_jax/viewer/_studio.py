@@ -14,8 +14,8 @@ from ..errors import FormatError, MissingDependencyError
 from ..geometry import Texture
 from ..io import AnimatedMesh, Look, smooth_normals
 
-Camera = Literal["three-quarter", "front", "follow", "turntable"]
-CAMERAS: tuple[Camera, ...] = ("three-quarter", "front", "follow", "turntable")
+Camera = Literal["three-quarter", "front", "back", "follow", "turntable"]
+CAMERAS: tuple[Camera, ...] = ("three-quarter", "front", "back", "follow", "turntable")
 BACKGROUNDS: dict[str, tuple[str, str]] = {
     "studio": ("#f1f3f5", "#cdd5de"),
     "white": ("#ffffff", "#ffffff"),
@@ -116,8 +116,8 @@ class Studio:
         meshes: Meshes to show, the person first [m], Y up.
         size: Width and height of the picture.
         fps: Frames per second, for the camera's motion.
-        camera: ``three-quarter`` and ``front`` look from a fixed direction, as the person
-            faces on average in the first second; ``follow`` turns with the person;
+        camera: ``three-quarter``, ``front`` and ``back`` look from a fixed direction, as the
+            person faces on average in the first second; ``follow`` turns with the person;
             ``turntable`` goes around once. All keep the person in the middle.
         background: A name in `BACKGROUNDS`, or ``#rrggbb``.
         title: Text above the picture.
@@ -165,7 +165,7 @@ class Studio:
             about = gaussian_filter1d(turn, max(2 * width, 1e-3), mode="nearest")
         elif camera == "turntable":
             about = about + np.linspace(0.0, 2.0 * np.pi, frames, endpoint=False)
-        about = about + (0.0 if camera == "front" else np.radians(_BESIDE))
+        about = about + {"front": 0.0, "back": np.pi}.get(camera, np.radians(_BESIDE))
         up = np.radians(_ABOVE)
         ahead = np.stack([np.sin(about), np.zeros(frames), np.cos(about)], axis=1)
         way = np.cos(up) * ahead + np.sin(up) * np.array([0.0, 1.0, 0.0])

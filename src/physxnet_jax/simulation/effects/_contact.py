@@ -305,8 +305,10 @@ class _Contact(Prepared):
         posed: PosedPoints,
         at: Int[Array, "some batch"],
     ) -> Float[Array, "some 3 batch"]:
-        """Points deep in the body, raised above the skin that they were at: the nearest skin may
-        be that of a limb's other side."""
+        """Points, raised above the skin that they were at if they are deep in the body.
+
+        The skin nearest to a point in a limb may be that of the limb's other side.
+        """
         lane = jnp.arange(points.shape[2])[None]
         there, normal = (
             jnp.moveaxis(jax.lax.stop_gradient(v)[at, :, lane], -1, 1)
