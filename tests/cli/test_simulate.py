@@ -32,6 +32,7 @@ from physxnet_jax.garment import FABRICS, square_sheet, template
 from physxnet_jax.io import write_obj
 from physxnet_jax.motion import body_animation, load_motion
 from physxnet_jax.simulation import (
+    PRESETS,
     STANDARD,
     XPBD,
     Effect,
@@ -507,6 +508,30 @@ def test_guided_takes_fabric_wind_and_substeps_alone(tmp_path, capsys):
         assert (says or "") in capsys.readouterr().err
     assert main([*words, "--strain-iterations", "2", "-o", str(tmp_path / "no.npz")]) == 2
     assert "--method guided has none" in " ".join(capsys.readouterr().err.split())
+
+
+def test_substeps_of_a_scene_file(tmp_path, monkeypatch):
+    """They act unless the command asks for others, or for an accuracy."""
+    from physxnet_jax.cli import _dress
+
+    scene = tmp_path / "scene.toml"
+    scene.write_text('motion = "balance"\nframes = 2\ngarments = ["bottom"]\nsubsteps = 24\n')
+    found = []
+
+    def note(job, *_):
+        found.append(job.simulation.solver)
+        raise PhysXNetError("seen")
+
+    monkeypatch.setattr(_dress, "_run", note)
+    for words in ((), ("--substeps", "48"), ("--accuracy", "draft")):
+        assert main(["simulate", str(scene), "-o", str(tmp_path / "a.npz"), *words]) == 2
+    assert [s.substeps for s in found] == [24, 48, PRESETS["draft"].substeps]
+    kept = load_scene(scene)
+    write_scene(tmp_path / "again.toml", kept, kept.scene.effects)
+    assert kept.substeps == load_scene(tmp_path / "again.toml").substeps == 24
+    scene.write_text('motion = "balance"\nsubsteps = 0\n')
+    with pytest.raises(FormatError, match="substeps is 0"):
+        load_scene(scene)
 
 
 @pytest.mark.release

@@ -193,8 +193,11 @@ def _scene_job(command: Simulate) -> _Job:
     options = command.simulation
     notes = found.notes
     if options.engine == "xpbd":
+        # An accuracy that is asked for comes with its own steps.
+        if options.accuracy is None and options.substeps is None:
+            options = dataclasses.replace(options, substeps=found.substeps)
         options = dataclasses.replace(options, accuracy=options.accuracy or found.accuracy)
-    elif found.accuracy != "standard":
+    elif found.accuracy != "standard" or found.substeps is not None:
         notes = (*notes, f"{command.scene}: its accuracy is xpbd's; {options.engine} has its own.")
     simulation = options.build()
     if options.engine in EXTERNAL_ENGINES:

@@ -5,11 +5,10 @@ import dataclasses
 from rich.console import Console
 from rich.table import Table
 
-from ..dressing import make_scene, write_scene
+from ..dressing import Simulation, make_scene, write_scene
 from ..errors import FormatError
 from ..evaluation import price_effects, recommend_effects, recommended_effects
 from ..files import check_writable, write_json
-from ..simulation import PRESETS
 from ._commands import Effects
 from ._dress import is_scene_file, scene_file
 from ._options import with_animation
@@ -34,7 +33,10 @@ def price(command: Effects, console: Console) -> int:
             simulation=command.simulation.build(),
             **source,
         )
-    solver = PRESETS[command.simulation.accuracy or job.accuracy].at_rate(job.motion.fps)
+    accuracy = command.simulation.accuracy
+    steps = None if accuracy else job.substeps
+    simulation = Simulation(accuracy=accuracy or job.accuracy, substeps=steps)
+    solver = simulation.solver.at_rate(job.motion.fps)
     with progress_bars(console) as bars:
         if command.recommend:
             rows, advice = recommend_effects(

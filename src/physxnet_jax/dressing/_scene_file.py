@@ -40,6 +40,7 @@ SCENE_KEYS: dict[str, type | tuple[type, ...]] = {
     "start": (int, float),
     "frames": int,
     "accuracy": str,
+    "substeps": int,
     "garments": list,
     "shape": dict,
     "standard": bool,
@@ -57,6 +58,7 @@ class SceneFile:
         motion: The body's motion.
         accuracy: ``draft``, ``standard``, ``fine`` or ``reference``.
         lists_effects: Whether a file names effects.
+        substeps: Steps a frame in place of those of ``accuracy``, see `Simulation`.
         keys: Keys of a scene file that state the motion and the garments; empty if they were
             given as objects.
         notes: Remarks on the motion and on garments read from files.
@@ -67,6 +69,7 @@ class SceneFile:
     accuracy: Accuracy = "standard"
     notes: tuple[str, ...] = ()
     lists_effects: bool = False
+    substeps: int | None = None
     keys: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
 
@@ -84,6 +87,8 @@ def write_scene(path: str | pathlib.Path, scene_file: SceneFile, effects: Sequen
     if not scene_file.keys:
         raise FormatError("A scene of objects in memory can't be written; name clips and files.")
     keys = {**scene_file.keys, "accuracy": scene_file.accuracy, "standard": False}
+    if scene_file.substeps is not None:
+        keys["substeps"] = scene_file.substeps
     tables = {k: v for k, v in keys.items() if isinstance(v, dict)}
     lines = [f"{k} = {json.dumps(v)}" for k, v in keys.items() if k not in tables | {"garments": 0}]
     for garment in keys["garments"]:
@@ -207,6 +212,7 @@ def make_scene(
         clip,
         simulation.accuracy,
         notes if fault is None else (fault, *notes),
+        substeps=simulation.substeps,
         keys={} if shape is not None else _scene_keys(motion, wear, options),
     )
 
@@ -228,6 +234,7 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         start = 0.5                # seconds
         frames = 60
         accuracy = "standard"
+        substeps = 256             # in place of those of the accuracy
 
         [[garments]]               # instead of the list, to choose fabrics
         file = "shirt"
@@ -268,6 +275,7 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         frames=min((n for n in (frames, text.get("frames")) if n is not None), default=None),
         simulation=Simulation(
             accuracy=text.get("accuracy", "standard"),
+            substeps=text.get("substeps"),
             effects=None if standard else tuple(listed),
         ),
         shape=shape,
@@ -319,6 +327,8 @@ def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, Any]
     for key in ("fps", "source_fps"):
         if not 0 < float(text.get(key, 30.0)) <= 1e4:
             raise FormatError(f"{path}: {key} is {text[key]}, expected a positive number.")
+    if text.get("substeps", 1) < 1:
+        raise FormatError(f"{path}: substeps is {text['substeps']}, expected a positive number.")
     if text.get("up") not in (None, "y", "z"):
         raise FormatError(f"{path}: up is y or z.")
     if text.get("accuracy", "standard") not in PRESETS:

@@ -22,6 +22,7 @@ _ABOUT = {
     "start": "start within the motion [s]",
     "frames": "keep only this many frames; all by default",
     "accuracy": "accuracy of the simulation",
+    "substeps": "steps a frame at 30 frames per second, in place of those of the accuracy",
     "garments": "garments as for --wear, in any order; or tables of `file` and `fabric`",
     "shape": "shape parameters of the body by name (`physxnet clips` lists them)",
     "standard": "whether the standard effects act too",
