@@ -27,14 +27,20 @@ def closing_table(clip: DressedClip) -> list[Table]:
         first = f"{stage.cold_ms:.0f}" if by_frames else ""
         times.add_row(stage.name, whole, first, f"{stage.warm_ms:.2f}" if by_frames else "")
     times.add_row("total", f"{sum(_milliseconds(clip, s) for s in clip.stages):.0f}", "", "")
-    fit = Table(title="garments, and their share inside the body", title_justify="left")
+    fit = Table(
+        title="garments, and their share inside the body before and after collisions",
+        title_justify="left",
+        caption="rays hit: vertices bound to the skin where a ray meets it; no ray: how many are"
+        " bound to the nearest skin in place of it",
+        caption_justify="left",
+    )
     for name in (
         "garment",
         "vertices",
         "rays hit",
-        "fallbacks",
-        "raw",
-        "inside",
+        "no ray",
+        "before",
+        "after",
         "worst frame",
     ):
         if name == "garment":
