@@ -52,6 +52,21 @@ def pytest_configure(config):
         size -= stats[path].st_size
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """Of a test marked ``sampled(n)``, n cases evenly spread stay; the others are nightly."""
+    cases = {}
+    for item in items:
+        if item.get_closest_marker("sampled") and not item.get_closest_marker("nightly"):
+            cases.setdefault(item.nodeid.partition("[")[0], []).append(item)
+    for some in cases.values():
+        (count,) = some[0].get_closest_marker("sampled").args
+        kept = {k * len(some) // count for k in range(count)}
+        for k, item in enumerate(some):
+            if k not in kept:
+                item.add_marker(pytest.mark.nightly)
+
+
 # Two workers must fit a laptop; compiled programs are most of a worker's memory [bytes].
 _MOST_MEMORY = 0.9e9
 

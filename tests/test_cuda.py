@@ -86,7 +86,7 @@ def test_work_counts_loops_and_products():
     assert ceilings.seconds(floor["Work"](2e9, 1e9)) == pytest.approx(2.0)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_packed_motions_are_the_actions(tmp_path, data_dir, monkeypatch):
     monkeypatch.syspath_prepend(str(CUDA))
     pack = runpy.run_path(str(CUDA / "pack.py"))

@@ -121,7 +121,7 @@ def losses(folder):
     return np.array([[x["step"], x["loss"]] for x in lines if "loss" in x])
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_losses_of_adam_agree_on_two_devices(tmp_path):
     finish(
         start(tmp_path / "one", optimizer="adam"),

@@ -87,7 +87,7 @@ def run(tmp_path):
     return one
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_second_run_uses_the_compilation_cache_silently(run, tmp_path):
     words = ("dress", "walk", "--wear", "bottom", "--method", "lbs", "--frames", "2", "--quiet")
     first = run(*words, "--out", "a.npz")

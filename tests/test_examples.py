@@ -23,6 +23,7 @@ def test_examples_are_numbered_without_gaps():
     assert [p.name[:2] for p in EXAMPLES] == [f"{k:02d}" for k in range(8)]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda p: p.stem)
 def test_examples_run(path, tmp_path):
     """As a user runs it: a process of its own, in a folder of its own."""
@@ -61,6 +62,7 @@ def test_notebook_runs_and_contains_no_output(capsys):
     assert "True\n" in capsys.readouterr().out
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("path", PAGES, ids=lambda p: p.stem)
 def test_code_of_each_page_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -176,6 +176,7 @@ def test_formats_that_are_held_in_memory_refuse_what_is_too_large(tmp_path):
     check_output(tmp_path / "a.usdc", 2000, 30_000)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.release
 @pytest.mark.parametrize("method", ["lbs", "network", "guided", "simulate"])
 def test_dressing_on_disk_is_dressing_in_memory(method, tmp_path):
@@ -203,6 +204,7 @@ def test_dressing_on_disk_is_dressing_in_memory(method, tmp_path):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.release
 @pytest.mark.parametrize("method", ["network", "guided"])
 def test_dressing_goes_on_where_it_was_stopped(method, tmp_path):

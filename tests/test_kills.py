@@ -64,7 +64,7 @@ def stored(folder, out):
     return len(list((folder / out).glob("*/bottom/zarr.json")))
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_a_killed_build_goes_on_to_the_same_bytes(place):
     folder, digest = place
     process = build(folder, "one")

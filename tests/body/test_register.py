@@ -35,7 +35,7 @@ def stranger(body):
     return rest, x, vertices.astype(np.float32), faces.astype(np.int32)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_registration_recovers_another_body_vertex_by_vertex(body, stranger):
     rest, x, vertices, faces = stranger
     seen = []
@@ -90,7 +90,7 @@ def _chest(x, side):
     return rows[x[rows, 2].argmax()]
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_meshes_that_are_not_bodies_are_refused():
     ball = trimesh.creation.icosphere(4, 0.8)
     vertices = np.asarray(ball.vertices, np.float32)

@@ -142,7 +142,7 @@ def test_evaluated_errors_are_copied_to_the_rows(tiny, tmp_path):
     assert main([*words, "--errors", str(rows)]) == 2
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_gradients_are_measured_on_request(tiny, tmp_path, hasty):
     out = tmp_path / "net.json"
     words = ["--weights", str(tiny), "--batches", "3", "--garments", "1", "--backward", "--quiet"]

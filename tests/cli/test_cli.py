@@ -34,7 +34,7 @@ def test_doctor_and_clips_print_the_installation_and_the_clips(capsys):
     assert "side step" in capsys.readouterr().out
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_commands_that_print_tables_also_print_json(tmp_path, capsys, monkeypatch):
     """One text each, whose numbers are those of the table."""
 

@@ -53,7 +53,7 @@ def test_names_of_joints_do_not_reset_the_terminal(tmp_path, capsys, command):
     assert not has_controls(said.out) and not has_controls(said.err)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_names_of_meshes_do_not_reset_the_terminal(tmp_path, capsys):
     path = tmp_path / "a.obj"
     x = np.random.default_rng(0).normal(size=(9, 3))

@@ -81,7 +81,7 @@ def test_scene_files_are_simulated_and_written(tmp_path, capsys):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.npz", "scene.toml"]
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_only_frames_can_override_a_scene_file(tmp_path, capsys):
     scene = tmp_path / "scene.toml"
     scene.write_text(TOML)
@@ -195,7 +195,7 @@ def test_garment_paths_resolve_relative_to_the_scene_file(tmp_path, monkeypatch)
         assert garment.template == "bottom"
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_notes_of_garment_files_match_dress(tmp_path, capsys):
     mesh = template("bottom").mesh
     vertices = np.array(mesh.vertices)
@@ -437,7 +437,7 @@ def test_missing_blender_error_names_the_environment_variable(monkeypatch):
         find_blender()
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_rollout_fingerprint_is_equal_across_processes():
     """What is kept is found again by the next process, whose memory lies elsewhere."""
     code = (

@@ -30,7 +30,7 @@ def plain(mocap, tmp_path_factory):
     return dataset_digest(root)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_dataset_of_a_cluster_that_loses_a_machine_has_the_same_bytes(mocap, plain, tmp_path):
     ray = pytest.importorskip("ray", reason="Ray isn't installed: physxnet-jax[cluster]")
     from ray.cluster_utils import Cluster

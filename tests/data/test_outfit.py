@@ -29,7 +29,7 @@ def mocap(tmp_path_factory, write_mocap):
     return write_mocap(tmp_path_factory.mktemp("mocap"), 40, actions)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_garments_are_cut_for_the_person():
     garments = PAIR.garments()
     assert list(garments) == ["bottom", "top"], "innermost first"

@@ -179,7 +179,7 @@ def test_configuration_augments_the_actions(data_dir):
     np.testing.assert_allclose(both.root[0] * jnp.array([-1.0, 1.0, 1.0]), plain.root[0], atol=1e-5)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_left_out_frames_overlap_no_action(data_dir):
     actions = read_protocol(data_dir / "mocap")
     rest = left_out(data_dir / "mocap", actions)
@@ -243,6 +243,7 @@ def test_damaged_dataset_metadata_is_reported(tmp_path, text):
         open_dataset(tmp_path, {"fps": 30})
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.release
 @pytest.mark.parametrize(("left", "speed"), [(False, 1.25), (True, 0.8)])
 def test_expected_frames_match_the_built_actions(data_dir, tmp_path, left, speed):

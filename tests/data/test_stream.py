@@ -170,7 +170,7 @@ def test_entries_of_stored_actions_are_those_of_actions_in_memory(tmp_path):
     )
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_memory_does_not_grow_with_the_dataset(tmp_path):
     garment, clip = template("bottom"), load_motion("walk", fps=30.0)
     motion = dataclasses.replace(clip, rotations=clip.rotations[:40], root=clip.root[:40])

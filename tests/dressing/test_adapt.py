@@ -26,7 +26,7 @@ def taught():
     return adapt("bottom:fabric=wool", **SHORT)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_potential_falls_and_only_the_decoder_of_the_garment_changes(taught):
     assert taught.loss[1] < taught.loss[0] and taught.potential[1] < taught.potential[0]
     assert taught.steps in (2, 4) and taught.rmse_mm is None
@@ -67,7 +67,7 @@ def test_an_interrupted_run_resumes_to_the_same_network(taught, tmp_path):
         adapt("bottom:fabric=wool", **SHORT, resume=other_files)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_a_run_that_does_worse_returns_the_network_as_it_was():
     wild = dataclasses.replace(CONFIG, learning_rate=30.0, steps=2)
     done = adapt("bottom", weights="nano", frames=6, config=wild)

@@ -143,7 +143,7 @@ def test_network_and_simulation_dress_a_character(man, character):
         assert rmse(slow.garments[0].positions, same.garments[0].positions) < 0.025
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_cloth_follows_residual_skin_motion(character):
     """A belly that swells by 3 cm takes the shirt with it; without that it doesn't."""
     rest = np.asarray(character.body.rest_vertices(character.body.default_shape()))[:13380]
@@ -244,7 +244,7 @@ def test_near_skin_follows_sliding_cloth_but_not_to_another_limb(character):
     np.testing.assert_array_equal(_near(patch, still, skin, crossed)[shin], usual[shin])
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_skin_registered_to_another_limb_is_ignored(man, monkeypatch):
     """One vertex goes its own way, as a thigh's does that was laid onto a hand."""
     _, _, mesh, bind = man
@@ -325,7 +325,7 @@ def test_dress_command_dresses_an_animated_body_file(man, tmp_path, capsys):
     assert main(["dress", "walk", "--animated-body"]) == 2
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_dress_command_retargets_a_motion_to_a_rig(body, tmp_path, capsys):
     shape = body.shape(gender=1.0, height_up=0.5)
     path = rigged_person(tmp_path / "me.vrm", body, shape)
@@ -352,7 +352,7 @@ def test_dress_command_retargets_a_motion_to_a_rig(body, tmp_path, capsys):
     assert "no joint 'nowhere'" in capsys.readouterr().err
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_ten_kilometres_away_a_character_wears_the_same(man):
     _, _, mesh, bind = man
     away = np.asarray([10_000.0, 0.0, -8_000.0], np.float32)

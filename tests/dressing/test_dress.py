@@ -24,7 +24,7 @@ def test_lbs_is_linear_blend_skinning(body, rest):
     assert clip.hit_rate["top"] is None and clip.num_frames == 18
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_network_cloth_differs_from_skinning_and_stays_near_the_body():
     # Weights that learned these fitted garments.
     fitted = Inference(weights="paper")
@@ -85,7 +85,7 @@ def test_simulated_cloth_is_finite_and_pinned_at_the_waist():
     assert np.abs(gap).max() < 1e-4
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_trousers_change_only_where_a_top_covers_them():
     both = dress("walk", ["top", "bottom"], method="network", frames=16)
     alone = dress("walk", ["bottom"], method="network", frames=16)
@@ -111,6 +111,7 @@ def test_empty_outfits_and_zero_frames_are_refused():
         dress("walk", method="lbs", frames=0)
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.release
 @pytest.mark.parametrize("push", [False, True])
 def test_evaluation_matches_dress(push):
@@ -127,6 +128,7 @@ def test_evaluation_matches_dress(push):
     assert np.abs(measured[:lead] - clip.garments[0].positions[:lead]).max() < 0.05
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.release
 @pytest.mark.parametrize("start", [0.1, 1.0])
 def test_partial_motion_matches_the_whole_motion(start):

@@ -72,7 +72,7 @@ def _with_collisions(dresser, wanted):
     return dresser if wanted else dataclasses.replace(dresser, colliders=None, layers=None)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_with_shape_matches_a_dresser_made_for_the_shape(dresser, shapes, motion):
     for collisions in (False, True):
         mine = _with_collisions(dresser, collisions)
@@ -167,7 +167,7 @@ def test_exported_dresser_runs_without_this_package(dresser, whole, motion, tmp_
     assert done.returncode != 0 and "damaged" in done.stderr
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_template_binding_is_unchanged_on_a_scaled_body(body):
     large = dataclasses.replace(body, bases=1.15 * body.bases, deltas=1.15 * body.deltas)
     ours, theirs = (
@@ -251,7 +251,7 @@ def test_poses_of_another_skeleton_are_refused_under_jit_too(dresser, motion):
         with_shape(dresser, jnp.ones(5))
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_dress_accepts_a_predictor_and_a_single_garment_name(dresser, motion):
     known = dresser.predictor
     clip = dress("walk", "bottom", method="network", inference=Inference(weights=known), frames=2)
@@ -342,6 +342,7 @@ print(len(jax.devices()), "devices")
     assert done.returncode == 0 and "2 devices" in done.stdout, done.stderr[-2000:]
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.release
 @pytest.mark.parametrize("fps", [30.0, 120.0])
 def test_clip_starts_without_a_jump(fps, monkeypatch):

@@ -180,7 +180,7 @@ def test_gradients_by_the_pose(guided, motion, slope_error):
         assert slope_error(height, gradient, places, (1e-7, 1e-8, 1e-9)) < 1e-5
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_fabric_and_wind_act(motion):
     q, p = motion.rotations[:24], motion.root[:24]
 
@@ -243,7 +243,7 @@ def test_an_export_gives_the_clip(guided, motion, tmp_path, apart):
         assert apart(found, wanted) < 1e-4
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["slim", "pencil-skirt"])
 def test_denim_is_predicted_as_near_the_skin_as_cotton_is(kind):
     """No network learned from denim; seen as it is, it was thrown 10 cm off."""

@@ -45,7 +45,7 @@ def test_clean_garment_is_reported_ready(tmp_path, trousers):
     assert found.hit_rate > 0.95 and found.outward > 0.95 and found.inside < 0.02
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_all_faults_are_reported_and_repaired(tmp_path, trousers):
     v, faces = trousers
     alone = np.arange(faces.size).reshape(-1, 3)
@@ -154,7 +154,7 @@ def test_fitting_applies_the_requested_edge_lengths(tmp_path, trousers):
     assert found.health.longest_edge < 0.055 and found.health.components == 1
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_inspect_and_fit_commands_print_the_report(tmp_path, trousers, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     good, bad = (
@@ -209,6 +209,7 @@ def test_fitted_real_dress_is_reported_ready(data_dir, tmp_path):
     assert found.problems == () and found.template == "dress" and found.inside == 0.0
 
 
+@pytest.mark.sampled(1)
 @pytest.mark.release
 @pytest.mark.parametrize("name", ["top", "bottom", "dress"])
 def test_alignment_recovers_any_axis_and_heading(name):
@@ -312,7 +313,7 @@ def test_garments_with_two_legs_are_classified_as_trousers(data_dir, trousers):
         assert guess_template(np.asarray(mesh.vertices), np.asarray(mesh.faces)) == name
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 @pytest.mark.parametrize("what", ["backwards", "too high"])
 def test_displaced_top_is_aligned_to_its_template(tmp_path, what):
     """Lifted out where it lies it would be ruined: it is moved to where it belongs."""

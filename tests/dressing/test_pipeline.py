@@ -39,7 +39,7 @@ def jaxpr(dresser, motion):
     return re.sub(r"0x[0-9a-f]+", "", text)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_sixty_frames_a_second_are_every_other_of_thirty():
     """Features are of the same moments; before the clip motion is extrapolated either way."""
     slow, fast = (load_motion("punch", fps=fps) for fps in (30.0, 60.0))

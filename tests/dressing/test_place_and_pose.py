@@ -78,6 +78,7 @@ def test_ten_kilometres_away_cloth_is_the_same(dresser, motion):
     np.testing.assert_allclose(streamed["bottom"], found["bottom"], atol=1.1e-3)
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.release
 @pytest.mark.parametrize("method", ["network", "lbs", "guided", "simulate"])
 def test_ten_kilometres_away_the_dressed_person_is_the_same(motion, method):
@@ -129,6 +130,7 @@ def test_a_bad_pose_affects_its_window_alone(dresser, motion, scale):
     np.testing.assert_allclose(streamed["bottom"], found["bottom"], atol=1e-5)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.release
 @pytest.mark.parametrize("which", ["rotations", "root", "first", "all"])
 def test_a_masked_loss_has_finite_gradients_in_all_other_frames(dresser, motion, which):

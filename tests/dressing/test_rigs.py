@@ -106,7 +106,7 @@ def test_garments_on_a_rig_are_not_persons(hero, tmp_path):
     assert not is_character(tmp_path / "missing.glb")
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_a_start_cuts_the_motion_of_characters(hero):
     walk = procedural_clip("walk", fps=30.0)
     whole = read_character(hero, motion=walk[:30])

@@ -95,7 +95,7 @@ def test_guided_cloth_of_another_shape_is_near_that_of_a_new_dresser(motion):
     assert off_alike < 0.03 * moved and off < 0.5 * moved and moved > 3e-3
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_gradients_by_pose_shape_cut_and_fabric_match_differences(guided, motion, slope_error):
     """In float64, within a thousandth: the whole way from a pose to the simulated cloth."""
     # What the tailor cuts is float32: its slope is taken once.

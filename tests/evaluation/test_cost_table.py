@@ -207,7 +207,7 @@ def test_what_is_chosen_keeps_the_budget_whatever_was_expected(profiles, budget)
             assert choice.ms_per_frame == truth[choice.profile.name] <= budget
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_every_packaged_method_can_dress():
     ladder = load_cost_table()
     names = {r.name for r in ladder}

@@ -44,7 +44,7 @@ def measure(methods, sequences, done=()):
     return list(evaluate(methods, sequences, templates=("bottom",), done=done))
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_skinning_error_equals_the_offset():
     rows = measure({"lbs": skinning()}, [sequence(), sequence("shifted", offset=(0.0, 0.01, 0.0))])
     assert [r.action for r in rows] == ["walk", "shifted"]
@@ -123,7 +123,7 @@ def test_nearest_frame_reproduces_training_frames():
     assert np.abs(known.offsets["bottom"]).max() > 0.02
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_pose_network_learns_pose_dependent_offsets():
     known = bent()
     frames = training_frames([known], ("bottom",))

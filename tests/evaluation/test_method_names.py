@@ -21,7 +21,7 @@ from physxnet_jax.motion import Motion, load_motion, mirrored
 from physxnet_jax.simulation import Scene, prepare_scene
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_mirror_suffix_makes_predictions_mirror_symmetric():
     walk = load_motion("punch", fps=30.0)
     walk = Motion(walk.rotations[40:48], walk.root[40:48], walk.fps, walk.name)
@@ -62,7 +62,7 @@ def test_external_engines_are_methods_like_any_other(monkeypatch):
         method_by_name("blender")(walk, "bottom")
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 @pytest.mark.parametrize("name", ["top", "dress"])
 def test_strain_limiting_suffix_reduces_strain_with_small_displacements(name):
     punch = load_motion("punch", fps=30.0)

@@ -32,7 +32,7 @@ def test_stiff_fabric_stays_flat_and_limp_fabric_hangs_down():
     assert drape_test(limp, edge=EDGE, seconds=4.0).coefficient < 40
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_cantilever_measures_the_bending_length():
     cotton = cantilever_test(FABRICS["cotton"], cells=16)
     assert cotton.measured == pytest.approx(cotton.length, rel=0.05)

@@ -142,6 +142,7 @@ print(held("VmHWM") - before)
 """
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.release
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 @pytest.mark.parametrize("case", CASES)

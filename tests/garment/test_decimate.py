@@ -84,7 +84,7 @@ def test_decimated_faces_do_not_cross_a_texture_seam():
     assert_allclose(uv[..., 1], corner[..., 1], atol=0.04)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_decimated_meshes_need_no_repair():
     """Of millimetre triangles, many of which collapse onto one point."""
     fine, _ = subdivide(template("top").mesh, 0.006)

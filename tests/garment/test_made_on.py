@@ -36,7 +36,7 @@ def other(body, tmp_path_factory):
     return folder
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 @pytest.mark.parametrize("kind", ["top", "dress"])
 def test_garments_come_back_from_the_body_that_they_were_made_on(other, kind):
     garment, report = load_garment(f"{other / kind}.obj:made_on={other / 'avatar.obj'}")

@@ -62,6 +62,7 @@ def wardrobe():
         ("m", "A-pose, arms at 25 degrees", -0.25, False),
     ],
 )
+@pytest.mark.sampled(10)
 @pytest.mark.release
 def test_frames_of_known_bodies_are_found(kind, unit, pose, raised, turned, wardrobe):
     """SMPL's origin, feet on the floor, facing backwards: within 3.5 cm of the truth."""

@@ -139,7 +139,7 @@ def test_fitting_keeps_polygons_and_materials(quilted, tmp_path):
     assert np.mean(finer.material == nearest) > 0.9
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_decimation_keeps_materials_and_texture(quilted, tmp_path):
     pytest.importorskip("fast_simplification")
     done, _ = fit_garment(quilted, tmp_path / "fitted.obj")

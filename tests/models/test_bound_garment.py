@@ -49,7 +49,7 @@ def test_the_paper_has_no_chart_for_skirts():
         ModelConfig(inputs=PAPER, skirt_chart=True)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_gradients_by_the_network_are_finite_and_zero_is_the_skinning(dressed):
     predictor, worn, world, shift = dressed
 

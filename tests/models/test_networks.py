@@ -489,7 +489,7 @@ print("finite" if bool(jnp.isfinite(found).all()) else "spoiled", float(jnp.abs(
 """
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_gradients_are_finite_in_unoptimised_programs():
     """Unoptimised programs compute values anew, and the maximum among them is none of them."""
     done = subprocess.run(

@@ -26,7 +26,7 @@ _SAMPLES = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))
 BVH, ASF, AMC = (_SAMPLES[name] for name in ("BVH", "ASF", "AMC"))
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_all_fifty_actions_load_with_the_frames_of_the_protocol(data_dir):
     actions = read_protocol(data_dir / "mocap")
     assert len(actions) == 50

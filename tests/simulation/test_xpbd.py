@@ -157,7 +157,7 @@ def test_contact_without_collisions_is_bitwise_neutral():
     np.testing.assert_array_equal(plain, contact)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_cloth_stays_on_the_shoulders_only_with_contact():
     g = template("top")
     motion = load_motion("stretch", fps=FPS)
@@ -170,7 +170,7 @@ def test_cloth_stays_on_the_shoulders_only_with_contact():
     assert worn.positions[0][-1, :, 1].mean() - fallen.positions[0][-1, :, 1].mean() > 0.5
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_batched_rollouts_match_single_rollouts():
     from physxnet_jax.simulation import simulate_batch
 
@@ -292,7 +292,7 @@ def test_diagnostics_of_a_frame_refer_to_that_frame():
     np.testing.assert_allclose(-moved, 9.81 * (fallen[1:] - 0.05 + 3 / 22 / 20), rtol=1e-3)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_company_in_the_batch_changes_no_bit():
     """Nor company that isn't finite."""
     scene = prepare_scene(Scene((template("bottom"),)))

@@ -75,7 +75,7 @@ def trained(walk, tmp_path_factory):
     return predictor, folder
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_custom_network_trains_and_dresses(trained):
     predictor, folder = trained
     lines = [json.loads(x) for x in (folder / "metrics.jsonl").read_text().splitlines()]

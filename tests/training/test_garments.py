@@ -169,7 +169,7 @@ def test_elastic_energy_is_that_of_each_garment_on_its_person(body):
     assert idle.elastic_energy(offsets, both, *still) is None
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_training_goes_on_from_weights_and_lowers_their_elastic_energy(learned, tmp_path):
     save_predictor(tmp_path / "w", learned, name="w")
     data = [sequence(TIGHT, 0.0), sequence(LOOSE, -OFF)]

@@ -334,7 +334,7 @@ def test_early_stopping_counts_repeated_steps_once_and_ignores_nan():
     assert watch.best == 5.0 and watch.update(4.0)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_interrupted_run_has_the_validation_of_an_uninterrupted_one(tmp_path):
     model = dataclasses.replace(CONFIG.model, templates=("bottom",))
     config = dataclasses.replace(
@@ -427,7 +427,7 @@ def test_gan_alarm_is_raised_by_either_loss_at_any_accuracy(loss, value, alarm):
     assert seen["gan_alarm"] == alarm
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_bfloat16_training_matches_float32_closely(tmp_path):
     last = {}
     for precision in ("float32", "bfloat16"):
@@ -540,7 +540,7 @@ def test_validation_without_usable_cloth_is_refused(tmp_path):
         train(config, data, tmp_path, steps=1)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_train_returns_the_weights_of_the_best_validation(tmp_path, monkeypatch):
     """Best after two of four steps: what comes back is the run of two."""
     data = [dataclasses.replace(sequence(seed=k), name=n) for k, n in enumerate("ab")]

@@ -94,7 +94,7 @@ def test_errors_are_reported_and_recovered_from(viewer, tmp_path):
         viewer.add_file("a.exe", b"MZ")
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_uploaded_fabric_is_worn(viewer, tmp_path):
     viewer.controls.settings["method"].value = METHOD_LABELS["simulate"]
     viewer.controls.settings["frames"].value = 2
@@ -259,7 +259,7 @@ def test_comparison_reports_distances_to_the_simulation():
     assert 0 < d.mean() < 0.05 and "mm RMSE from the simulation" in shown.summary
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_maps_display_velocity_and_acceleration():
     shown = run_job(Choice("punch", ("top",), inference=Inference(weights="paper"), frames=20))
     maps = shown.maps(10)
@@ -271,7 +271,7 @@ def test_maps_display_velocity_and_acceleration():
     assert maps["top"].shape == (64, 64, 3)
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_live_cloth_matches_the_clip_from_any_frame(viewer, apart):
     nano = Inference(weights="nano")
     choice = Choice(

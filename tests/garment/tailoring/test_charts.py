@@ -132,7 +132,7 @@ def test_attachment_weights_are_means(body):
             assert refs.max() < len(body.bases[0])
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_stored_charts_are_those_that_are_drawn(body):
     drawn = charts_from_arrays(build_charts(body))
     stored = load_charts()

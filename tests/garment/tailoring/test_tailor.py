@@ -54,6 +54,7 @@ def every_kind():
     return [k if k in QUICK else pytest.param(k, marks=pytest.mark.release) for k in KINDS]
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.release
 @pytest.mark.parametrize("name", every_kind())
 def test_every_kind_is_a_clean_mesh_around_the_body(body, name):
@@ -125,6 +126,7 @@ def test_ease_is_what_the_garment_is_wider_than_the_body(body, ease):
         assert found == pytest.approx(ease, abs=0.012), name
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.release
 @pytest.mark.parametrize("name", every_kind())
 def test_no_garment_crosses_itself_at_rest(name):

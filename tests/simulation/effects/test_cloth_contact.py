@@ -331,7 +331,7 @@ def test_layers_of_folds_that_face_each_other_stay_apart():
         assert ((behind > 0) == turned).all()
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_a_loose_top_over_a_shirt_keeps_its_order():
     motion = load_motion("punch", fps=30.0)
     motion = dataclasses.replace(motion, rotations=motion.rotations[:20], root=motion.root[:20])

@@ -42,7 +42,7 @@ def test_moves_of_all_samples_by_one_vector_move_the_vertices_by_no_more():
     assert (still == 0).all(), "samples that don't act move nothing"
 
 
-@pytest.mark.release
+@pytest.mark.nightly
 def test_skin_does_not_show_through_large_triangles(data_dir):
     garment, _ = load_garment(data_dir / "garments" / "helper_tights.obj")
     motion = load_motion("punch", fps=30.0)

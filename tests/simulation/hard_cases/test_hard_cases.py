@@ -49,6 +49,7 @@ def tier(name: str) -> pytest.MarkDecorator:
     return pytest.mark.nightly if name in _LONG else release
 
 
+@pytest.mark.sampled(9)
 @pytest.mark.parametrize("name", [pytest.param(name, marks=tier(name)) for name in CASES])
 def test_hard_case_findings_hold(name):
     for finding in run_case(name):
@@ -79,6 +80,7 @@ UNGUARDED = (
 )
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("name", "effects", "quantity"), [pytest.param(*c, marks=tier(c[0])) for c in UNGUARDED]
 )
