@@ -193,7 +193,7 @@ def _scene_job(command: Simulate) -> _Job:
     options = command.simulation
     notes = found.notes
     if options.engine == "xpbd":
-        # An accuracy that is asked for comes with its own steps.
+        # An accuracy in the command comes with its own steps.
         if options.accuracy is None and options.substeps is None:
             options = dataclasses.replace(options, substeps=found.substeps)
         options = dataclasses.replace(options, accuracy=options.accuracy or found.accuracy)
