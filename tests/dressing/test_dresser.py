@@ -33,6 +33,7 @@ def whole(dresser, motion):
     return jax.jit(clothe, static_argnames="fps")(dresser, *motion, fps=30.0)
 
 
+@pytest.mark.release
 def test_clothe_matches_dress(whole, motion):
     from physxnet_jax.motion import make_motion
 

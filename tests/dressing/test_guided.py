@@ -219,6 +219,7 @@ def test_another_guide_and_other_rates(motion, guided):
     assert _softness(240.0) == pytest.approx(8 / 128) and _softness(1e6) == 1.0
 
 
+@pytest.mark.release
 def test_options_that_it_has_not_are_refused(guided):
     for options in ({"engine": "bdf2"}, {"refine": 0.02}, {"accuracy": "fine"}):
         with pytest.raises(PhysXNetError, match="substeps and effects alone"):

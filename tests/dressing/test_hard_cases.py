@@ -139,6 +139,7 @@ def test_quaternion_signs_do_not_change_the_cloth(judge, motion):
         np.testing.assert_allclose(np.asarray(flipped[name]), np.asarray(x), atol=1e-5)
 
 
+@pytest.mark.release
 def test_non_finite_frame_affects_only_its_window(dresser, judge, motion):
     """The frames whose window holds it are NaN and say so; all others are untouched."""
     q, p = motion

@@ -190,6 +190,7 @@ def test_strain_and_fold_strength_are_compared_with_the_reference():
     )
 
 
+@pytest.mark.release
 def test_pinched_cloth_is_counted_separately(monkeypatch):
     def seen(assembly, motion, positions, *, frames, bare_skin):
         inside = np.zeros((len(frames), BOTTOM), bool)
