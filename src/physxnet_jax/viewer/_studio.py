@@ -16,6 +16,8 @@ from ..io import AnimatedMesh, Look, smooth_normals
 
 Camera = Literal["three-quarter", "front", "back", "follow", "turntable"]
 CAMERAS: tuple[Camera, ...] = ("three-quarter", "front", "back", "follow", "turntable")
+# How far the camera is turned from where the person faces, of those that aren't beside [rad].
+_TURNED = {"front": 0.0, "back": float(np.pi)}
 BACKGROUNDS: dict[str, tuple[str, str]] = {
     "studio": ("#f1f3f5", "#cdd5de"),
     "white": ("#ffffff", "#ffffff"),
@@ -165,7 +167,7 @@ class Studio:
             about = gaussian_filter1d(turn, max(2 * width, 1e-3), mode="nearest")
         elif camera == "turntable":
             about = about + np.linspace(0.0, 2.0 * np.pi, frames, endpoint=False)
-        about = about + {"front": 0.0, "back": np.pi}.get(camera, np.radians(_BESIDE))
+        about = about + _TURNED.get(camera, float(np.radians(_BESIDE)))
         up = np.radians(_ABOVE)
         ahead = np.stack([np.sin(about), np.zeros(frames), np.cos(about)], axis=1)
         way = np.cos(up) * ahead + np.sin(up) * np.array([0.0, 1.0, 0.0])
