@@ -182,7 +182,7 @@ def _start_all(run: Run) -> int:
     WORK.mkdir(parents=True)
     if run.toy:
         _write_toy_motions(run.folder)
-        some = tuple(o for t in ("cuda_default", "variants") for o in _dataset(run, t).outfits)
+        some = tuple(o for t in ("default", "variants") for o in _dataset(run, t).outfits)
         pack_clothes(WORK / "packed.pkl", some, _network_config(run, NETWORKS[-1]))
     else:
         unpack_motions(PACK / "mocap.npz", run.folder)
@@ -369,7 +369,7 @@ def _read(path: pathlib.Path) -> list[Sequence]:
 
 
 def clothes(run: Run, number: int) -> None:
-    config = _dataset(run, "cuda_default")
+    config = _dataset(run, "default")
     outfit = config.outfits[number]
     ((name, garment),) = outfit.garments().items()
     began = time.perf_counter()
@@ -429,8 +429,7 @@ def variants(run: Run, number: int) -> None:
 
 
 def paper(run: Run) -> None:
-    config = _dataset(run, "cuda")
-    config = dataclasses.replace(config, solver=XPBD(32, 1) if run.toy else DatasetConfig().solver)
+    config = DatasetConfig(solver=XPBD(32, 1)) if run.toy else DatasetConfig()
     people = _motions(run, ("train",), (Way(),))
     joined: dict[str, Sequence] = {}
     for name in config.templates[:1] if run.toy else config.templates:

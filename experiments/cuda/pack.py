@@ -89,7 +89,7 @@ def outfits() -> tuple[Outfit, ...]:
     """All outfits that are learned, in the order of the tables."""
     found = [
         read_config(str(HERE.parent / f"datasets.toml#{table}"), DatasetConfig).outfits
-        for table in ("cuda_default", "variants")
+        for table in ("default", "variants")
     ]
     return tuple(dict.fromkeys(o for some in found for o in some))
 
