@@ -34,7 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from pack import FOLDERS, pack_clothes, unpack_motions
-from rich.console import Console
+from places import OUT, PACK, ROOT, WORK, say, shown
 
 from physxnet_jax.body import load_body
 from physxnet_jax.cli._configs import read_config
@@ -73,11 +73,6 @@ from physxnet_jax.training import (
     train,
 )
 
-HERE = pathlib.Path(__file__).parent
-ROOT = HERE.parent.parent
-OUT = pathlib.Path(os.environ.get("OUT", "out/cuda/results"))
-PACK = pathlib.Path(os.environ.get("PACK", "out/cuda"))
-WORK = pathlib.Path(os.environ.get("WORK", "out/cuda/work"))
 SHARDS = 12
 NETWORKS = ("base", "small", "nano")
 # Shares of the time that is left when their data are ready.
@@ -87,7 +82,6 @@ VARIANTS_UNTIL, PAPER_UNTIL = 0.36, 0.45
 # Clips have a multiple of so many frames: each length is a program.
 _STEP = 16
 _PIECE = 15_000_000
-_CONSOLE = Console()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,16 +127,14 @@ class Run:
 
     def say(self, text: str) -> None:
         """Prints a line with the time."""
-        line = f"{time.time() - self.start:5.0f} s  {text}"
-        _CONSOLE.print(line, markup=False, highlight=False, soft_wrap=True)
+        say(f"{time.time() - self.start:5.0f} s  {text}")
 
     def add(self, role: str, what: str, **values: Any) -> None:
         """Stores a row."""
         rows = WORK / f"{role}.json"
         known = json.loads(rows.read_text()) if rows.is_file() else []
         write_json(rows, [*known, {"what": what, **values}])
-        shown = (f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items())
-        self.say(f"{what}: {', '.join(shown)}")
+        self.say(f"{what}: {shown(values)}")
 
 
 def main() -> int:
@@ -222,7 +214,7 @@ def _start_all(run: Run) -> int:
     write_json(OUT / "learned.json", rows)
     for role, found in rows.items():
         for row in found:
-            _CONSOLE.print(role, row, markup=False, highlight=False, soft_wrap=True)
+            say(f"{role:12} {shown(row)}")
     if failed:
         run.say(f"not finished: {', '.join(failed)}")
     return 1 if failed else 0
@@ -447,14 +439,7 @@ def paper(run: Run) -> None:
         learn = dataclasses.replace(learn, model=model, batch=4, validate_every=20)
     data = load_data(learn, list(joined.values()))
     until = 0.9 if run.toy else PAPER_UNTIL
-    _learn(
-        run,
-        "paper",
-        learn,
-        data,
-        lambda: run.left(until),
-        make_optimizer(learn, learn.learning_rate, 1),
-    )
+    _learn(run, "paper", learn, data, lambda: run.left(until))
 
 
 class _Progress(NamedTuple):
@@ -486,13 +471,12 @@ def _learn(
     config: TrainConfig,
     data: TrainingData,
     left: Callable[[], float],
-    optimizer: optax.GradientTransformation | None = None,
 ) -> None:
-    """Learns for the time that is left, annealed to its end, and packs the weights."""
+    """Learns for the time that is left, to whose end a rate falls, and packs the weights."""
     steps = 20 if run.toy else 60
 
-    def length(total: int) -> optax.GradientTransformation:
-        return optimizer or _annealed(config, total)
+    def length(total: int) -> optax.GradientTransformation | None:
+        return None if config.schedule == "constant" else _annealed(config, total)
 
     laps: list[float] = []
     began = time.perf_counter()
@@ -519,11 +503,11 @@ def _learn(
     validated = name == "paper"
 
     def report(done: int, _: int, values: dict[str, float]) -> None:
-        shown = {
+        found = {
             k: float(v) for k, v in values.items() if k.startswith(("validation", "l1", "los"))
         }
         if "validation_mm" in values or done % 500 == 0 or done == total:
-            run.add(name, f"step {done}", **shown)
+            run.add(name, f"step {done}", **found)
 
     began = time.perf_counter()
     final = config if validated else quiet

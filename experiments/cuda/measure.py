@@ -15,7 +15,6 @@ import faulthandler
 import importlib.metadata
 import json
 import os
-import pathlib
 import re
 import shutil
 import subprocess
@@ -28,7 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from floor import Ceilings, measure_ceilings, work_of
-from rich.console import Console
+from places import OUT, ROOT, WORK, say, shown
 
 import physxnet_jax as px
 from physxnet_jax.dressing import Inference, clothe, make_dresser
@@ -49,11 +48,6 @@ from physxnet_jax.simulation import (
     warmup,
 )
 
-HERE = pathlib.Path(__file__).parent
-ROOT = HERE.parent.parent
-OUT = pathlib.Path(os.environ.get("OUT", "out/cuda/results"))
-PACK = pathlib.Path(os.environ.get("PACK", "out/cuda"))
-WORK = pathlib.Path(os.environ.get("WORK", "out/cuda/work"))
 # The most seconds of each part, in order of worth.
 LIMITS = {
     "tests": 75,
@@ -62,14 +56,7 @@ LIMITS = {
 }
 # Left for the table and the last writes [s].
 _RESERVE = 10
-_CONSOLE = Console()
-_PIECE = 15_000_000
 _Rows = list[dict[str, Any]]
-
-
-def say(text: str) -> None:
-    """Prints a line, whole however long it is."""
-    _CONSOLE.print(text, markup=False, highlight=False, soft_wrap=True)
 
 
 class Record:
@@ -86,7 +73,7 @@ class Record:
     def add(self, what: str, **values: Any) -> None:
         """Adds a row, and writes all of the part."""
         self.rows.append({"what": what, **values})
-        say(f"  {what}: {_shown(values)}")
+        say(f"  {what}: {shown(values)}")
         stored = read_results()
         stored[self._part] = self.rows
         write_json(self._path, stored)
@@ -95,13 +82,6 @@ class Record:
 def read_results() -> dict[str, Any]:
     path = OUT / "results.json"
     return json.loads(path.read_text()) if path.is_file() else {}
-
-
-def _shown(values: dict[str, Any]) -> str:
-    texts = []
-    for name, value in values.items():
-        texts.append(f"{name} {value:.4g}" if isinstance(value, float) else f"{name} {value}")
-    return ", ".join(texts)
 
 
 def tests(record: Record, toy: bool, until: float) -> None:
@@ -300,7 +280,7 @@ def print_table() -> None:
                 )
                 and v is not None
             }
-            say(f"{part:10} {row['what']:62} {_shown(values)}")
+            say(f"{part:10} {row['what']:62} {shown(values)}")
 
 
 def main() -> int:

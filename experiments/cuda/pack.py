@@ -1,12 +1,11 @@
 """Packs what a CUDA machine without a network needs beside the tracked files.
 
 Command: python experiments/cuda/pack.py [--out out/cuda]
-Cost:    a quarter of an hour on two cores the first time; needs the motions (PHYSXNET_DATA) and the
-         package registry.
+Cost:    ten minutes; needs the motions (PHYSXNET_DATA) and the package registry.
 Result:  out/cuda/mocap.npz, the motions of training and extra actions with their tables;
          out/cuda/clothes.pkl, the garments of all outfits as cut and the tables that training makes
          of them; and out/cuda/wheels/, the pure Python packages that such a machine doesn't have.
-         Together under 60 MB; git ignores all.
+         Together 35 MB; git ignores all.
 """
 
 import argparse

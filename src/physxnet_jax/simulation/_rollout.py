@@ -111,7 +111,7 @@ def simulate(
         SimulationError: A frame isn't finite; the message names the frame, the vertex
             and the likely cause. Or ``accuracy`` is unknown.
     """
-    check_type(motion, Motion, "Pass a Motion, as load_motion('walk') gives.")
+    _check_motion(motion)
     if accuracy not in PRESETS:
         raise SimulationError(f"Unknown accuracy '{accuracy}'; choose {', '.join(PRESETS)}.")
     out = simulate_batch(
@@ -125,6 +125,10 @@ def simulate(
     if throw:
         out.check()
     return out
+
+
+def _check_motion(motion: object) -> None:
+    check_type(motion, Motion, "Pass a Motion, as load_motion('walk') gives.")
 
 
 @claims("resume")
@@ -166,7 +170,7 @@ def simulate_batch(
         raise SimulationError("No motion to simulate; pass at least one.")
     clear_caches_if_full()
     for motion in motions:
-        check_type(motion, Motion, "Pass a Motion, as load_motion('walk') gives.")
+        _check_motion(motion)
     if not isinstance(scene, PreparedScene):
         scene = prepare_scene(scene)
     used = min(len(jax.local_devices()), len(motions)) if devices is None else devices

@@ -64,7 +64,8 @@ def train(
         config: Settings of the run.
         sequences: Simulated actions, including those of ``config.validation``: their entries from
             `list_entries` or folders, which are read while others are learned from, or the actions.
-            Or what `load_data` made of them, for several runs on the same data.
+            Or what `load_data` made of them, for several runs on the same data: configurations
+            that differ in width, loss or optimizer, but not in maps, templates or batch.
         folder: Folder for checkpoints and ``metrics.jsonl``.
         network: Any module with the signature of `Generator`; a `Generator` by default.
         loss: Any function of `LossInputs`; `configured_loss` by default.
