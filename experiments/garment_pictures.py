@@ -4,8 +4,9 @@ Command: python experiments/garment_pictures.py [kinds] [measures] [fabrics] [ou
          (all by default); salsa needs $PHYSXNET_DATA or ../shared, else its column shows spin
 Cost:    half a minute a garment on two cores.
 Result:  docs/garments.png (front and back, at rest and in three poses), docs/measures.png,
-         docs/fabrics.png, docs/outfit.png, docs/look.png (shirt and trousers by the network, by
-         skinning, and simulated at three accuracies).
+         docs/fabrics.png, docs/outfit.png, docs/look.png (by skinning, network, guided, simulated:
+         shirt and trousers on a soft motion, a dress and a garment file on an abrupt one), and the
+         first two in motion, front and back: docs/soft.mp4, docs/abrupt.mp4.
 """
 
 import argparse
@@ -19,18 +20,24 @@ from rich.progress import track
 
 from physxnet_jax import Simulation, dress
 from physxnet_jax.body import load_body
-from physxnet_jax.garment import KINDS, Garment, tailor
+from physxnet_jax.garment import KINDS, Garment, load_garment, tailor
 from physxnet_jax.motion import Motion, body_animation, load_motion
 from physxnet_jax.simulation import Scene, prepare_scene, simulate_batch, standard_effects
 
 DOCS = pathlib.Path("docs")
+METHODS = ("lbs", "network", "guided", "simulate, reference")
+VIDEOS = {"salsa": "soft.mp4", "punch": "abrupt.mp4"}
 SKIN, COLOURS = "#d8b49c", ("#5f7fae", "#9a6b4f", "#6d8f6a")
+
+
+def shared() -> pathlib.Path:
+    return pathlib.Path(os.environ.get("PHYSXNET_DATA", "../shared"))
 
 
 def clip(name: str, frames: int) -> Motion:
     word = name
     if name == "salsa":
-        file = pathlib.Path(os.environ.get("PHYSXNET_DATA", "../shared")) / "mocap/daz/060_12.bvh"
+        file = shared() / "mocap/daz/060_12.bvh"
         word = str(file) if file.is_file() else "spin"
     m = load_motion(word, fps=30.0)
     return dataclasses.replace(m, rotations=m.rotations[:frames], root=m.root[:frames])
@@ -166,23 +173,49 @@ def outfit() -> None:
     save("outfit.png", grid(out, 3))
 
 
+def cloth_by(method: str, garments, motion: Motion) -> tuple[np.ndarray, ...]:
+    """Garments in every frame, by a method of `METHODS`."""
+    kind, _, accuracy = method.partition(", ")
+    simulation = Simulation(accuracy=accuracy) if accuracy else None
+    made = dress(motion, garments, method=kind, simulation=simulation, include_body=False)
+    jax.clear_caches()
+    return tuple(np.asarray(m.positions) for m in made.meshes)
+
+
+def scenes():
+    """A soft action, an abrupt one, and a garment file where there is one."""
+    yield "salsa", (tailor("trousers"), tailor("shirt")), clip("salsa", 60), (20, 40, 59)
+    yield "punch", (tailor("aline"),), clip("punch", 60), (15, 30, 45)
+    file = shared() / "garments/longsleeve.obj"
+    if file.is_file():
+        yield "longsleeve.obj", (load_garment(file)[0],), clip("punch", 60), (15, 30, 45)
+
+
 def look() -> None:
-    """Shirt over trousers on one motion, by every method, one row each."""
-    garments = (tailor("trousers"), tailor("shirt"))
-    motion, frames, out = clip("salsa", 60), (20, 40, 59), []
-    for method, accuracy in (
-        ("network", None),
-        ("lbs", None),
-        ("simulate", "draft"),
-        ("simulate", "standard"),
-        ("simulate", "reference"),
-    ):
-        simulation = None if accuracy is None else Simulation(accuracy=accuracy)
-        made = dress(motion, garments, method=method, simulation=simulation, include_body=False)
-        x = tuple(np.asarray(m.positions) for m in made.meshes)
-        parts = [views(garments, motion, x, f, (220, 420)) for f in frames]
-        out.append(titled(np.hstack(parts), f"{method}, {accuracy}" if accuracy else method))
-    save("look.png", np.vstack(out))
+    """Default garments and a file on a soft and an abrupt motion, by every method."""
+    rows = {method: [] for method in METHODS}
+    for name, garments, motion, frames in scenes():
+        clips = []
+        for method in METHODS:
+            x = cloth_by(method, garments, motion)
+            parts = [views(garments, motion, x, f, (200, 380)) for f in frames]
+            rows[method].append(np.hstack(parts))
+            clips.append([views(garments, motion, x, f, (320, 608)) for f in range(60)])
+        if name in VIDEOS:
+            titles = [titled(clip[0], m)[:26] for clip, m in zip(clips, METHODS, strict=True)]
+            pictures = [np.vstack([np.hstack(titles), np.hstack(each)]) for each in zip(*clips)]
+            video(VIDEOS[name], pictures)
+    save("look.png", np.vstack([titled(np.hstack(r), m) for m, r in rows.items()]))
+
+
+def video(name: str, pictures: list[np.ndarray]) -> None:
+    import imageio.v2 as imageio
+
+    with imageio.get_writer(DOCS / name, fps=30, quality=7, macro_block_size=2) as writer:
+        for picture in pictures:
+            height, width = (n - n % 2 for n in picture.shape[:2])
+            writer.append_data(picture[:height, :width])
+    print(f"{DOCS / name}: {(DOCS / name).stat().st_size / 1e6:.2f} MB")  # noqa: T201
 
 
 def main() -> None:

@@ -20,6 +20,8 @@ for call in (
     lambda: px.simulate(px.Scene((top,)), "walk"),
     lambda: px.simulate(px.Scene(top), walk),
     lambda: px.simulate(px.Scene(("top",)), walk),
+    lambda: px.dress("walk", ["top"], frames="3"),
+    lambda: px.dress("walk", ["top"], start="1"),
 ):
     try:
         call()
@@ -32,8 +34,9 @@ for call in (
 def test_errors_say_what_to_pass():
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, timeout=300)
     lines = done.stdout.splitlines()
-    assert done.returncode == 0 and len(lines) == 7, done.stdout + done.stderr[-2000:]
+    assert done.returncode == 0 and len(lines) == 9, done.stdout + done.stderr[-2000:]
     advice = ["A motion is", "A motion is", "a Scene", "a Scene", "a Motion", "a tuple", "garments"]
+    advice += ["a whole number", "a number of seconds"]
     assert all(some in line for some, line in zip(advice, lines, strict=True))
 
 

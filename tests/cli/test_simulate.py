@@ -410,7 +410,8 @@ def test_recommended_scene_is_written_and_simulated(tmp_path, capsys):
     assert (
         scene.scene.garments[0].fabric.bend == FABRICS["silk"].bend and scene.motion.num_frames == 2
     )
-    assert main(["effects", "balance", "--write-scene", str(needed)]) == 2
+    other = str(tmp_path / "other.toml")
+    assert main(["effects", "balance", "--write-scene", other]) == 2
     assert "add --recommend" in capsys.readouterr().err
 
 

@@ -164,3 +164,16 @@ def test_longest_boundary_loop_comes_first():
     for bow in ([[0, 1, 2], [0, 3, 4]], [[2, 0, 1], [3, 4, 0]], [[1, 2, 0], [4, 0, 3]]):
         (loop,) = boundary_loops(np.array(bow))
         assert sorted(loop.tolist()) == [0, 0, 1, 2, 3, 4]
+
+
+def test_normals_of_numpy_arrays_are_those_of_jax_arrays():
+    rng = np.random.default_rng(3)
+    vertices = rng.normal(size=(2, 9, 3)).astype(np.float32)
+    # One triangle is a point, one a line; the last vertex has no triangle.
+    faces = np.array([[0, 1, 2], [2, 1, 3], [4, 4, 4], [5, 6, 5], [3, 6, 7]], np.int32)
+    found = vertex_normals(vertices, faces)
+    assert isinstance(found, np.ndarray) and found.dtype == np.float32
+    compiled = vertex_normals(jnp.asarray(vertices), jnp.asarray(faces))
+    np.testing.assert_allclose(found, compiled, rtol=0, atol=1e-6)
+    assert not found[:, 8].any()
+    assert vertex_normals(vertices[0].astype(np.float64), faces).dtype == np.float64

@@ -221,9 +221,7 @@ class _Fit:
     def _pairs(self, p: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Body vertices with matching points, normals and distances, in both directions."""
         x = np.asarray(_posed(self.body, jnp.asarray(p, jnp.float32))[0], np.float64)
-        n = np.asarray(
-            vertex_normals(jnp.asarray(x, jnp.float32), jnp.asarray(self.faces)), np.float64
-        )
+        n = vertex_normals(x, np.asarray(self.faces))
         row, distance_to_target = self.target.nearest(x[self.body_rows], n[self.body_rows])
         points, normals = (
             self.target.points[self.target_rows],
@@ -312,7 +310,7 @@ def _project_to_surface(
     near = np.zeros(len(x))
     laplacian = _laplacian()
     for k, stiffness in enumerate(_STIFFNESS):
-        n = np.asarray(vertex_normals(jnp.asarray(x), faces))
+        n = vertex_normals(np.asarray(x), np.asarray(faces))
         row, distance = target.nearest(x, n)
         if k == 0:
             near = np.minimum(distance, 0.3)
@@ -329,7 +327,7 @@ def _project_to_surface(
             " on average. The mesh must show a person standing with limbs apart in the"
             " first frame or in the bind pose."
         )
-    n = np.asarray(vertex_normals(jnp.asarray(x), faces))
+    n = vertex_normals(np.asarray(x), np.asarray(faces))
     face, bary, distance = target.closest_facing(x, n)
     sure = distance < _CLOSE
     posed = np.einsum("vk,vkc->vc", bary, target.vertices[target.faces[face]])

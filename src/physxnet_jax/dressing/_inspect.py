@@ -281,10 +281,11 @@ def _report_placement(
 def covered_share(garment: Garment, skin: TriMesh) -> float:
     """Share of the skin's area that cloth lies over, at most `_OVER` away."""
     faces = np.asarray(skin.faces)
-    points, normals = np.asarray(skin.vertices), vertex_normals(skin.vertices, skin.faces)
+    points = np.asarray(skin.vertices)
+    normals = vertex_normals(points, faces)
     tree = KDTree(np.asarray(garment.mesh.vertices))
     distance, nearest = tree.query(points)
-    height = np.einsum("vc,vc->v", tree.data[nearest] - points, np.asarray(normals))
+    height = np.einsum("vc,vc->v", tree.data[nearest] - points, normals)
     lateral = np.sqrt(np.maximum(distance**2 - height**2, 0.0))
     over = (height > 0.0) & (distance < _OVER) & (lateral < _ASIDE + 0.7 * height)
     corner = points[faces]

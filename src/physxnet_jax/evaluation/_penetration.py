@@ -128,7 +128,7 @@ class _PosedSkin:
 
     def __init__(self, build: _SkinTopology, vertices: Float[np.ndarray, "body 3"]) -> None:
         self._build, self.vertices = build, vertices
-        self.normals = np.asarray(vertex_normals(jnp.asarray(vertices), jnp.asarray(build.faces)))
+        self.normals = vertex_normals(vertices, build.faces)
         self._whole = _tree(vertices)
         self._trees = [_tree(vertices[limb.vertices]) for limb in build.limbs]
 
@@ -209,7 +209,7 @@ class _CoveredSkin:
         # Only cloth that is worn on that skin: a hand in front of a hip isn't uncovered.
         worn = np.linalg.norm(self._assembly.rest[under] - self._home, axis=1) < _MAX_CLOTH_DISTANCE
         covered = np.flatnonzero(worn & self._is_covered)
-        normal = np.asarray(vertex_normals(jnp.asarray(x, jnp.float32), jnp.asarray(faces)))
+        normal = vertex_normals(x.astype(np.float32), faces)
         normal = normal * self._outwards[:, None]
         up, weights, face = _height(s[covered], x, normal, faces, self._around, under[covered])
         # Skin whose closest point lies on the hem is beside the cloth, not beneath it.
@@ -271,7 +271,7 @@ def _is_covered(
 ) -> Bool[np.ndarray, " body"]:
     """Skin that lies beneath cloth at rest, not beside its hem."""
     x = assembly.rest.astype(np.float32)
-    normal = np.asarray(vertex_normals(jnp.asarray(x), jnp.asarray(assembly.faces)))
+    normal = vertex_normals(x, assembly.faces)
     over = _nearest(x, skin)
     up, weights, face = _height(skin, x, normal * outwards[:, None], assembly.faces, around, over)
     beneath = (up < 0) & (up > -_MAX_CLOTH_DISTANCE)

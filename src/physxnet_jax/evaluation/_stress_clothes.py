@@ -75,7 +75,7 @@ def _lined_top() -> tuple[Garment, ...]:
     """The top with an outer shell 4 mm over it, sewn to it along all borders."""
     inner = template("top")
     x, f = np.asarray(inner.mesh.vertices), np.asarray(inner.mesh.faces)
-    outer = x + 0.004 * np.asarray(vertex_normals(inner.mesh.vertices, inner.mesh.faces))
+    outer = x + 0.004 * vertex_normals(x, f)
     n = len(x)
     faces = [f[:, ::-1], f + n]
     for loop in boundary_loops(f):

@@ -41,7 +41,7 @@ def clearance(
     p = jnp.asarray(np.asarray(points)[pick], jnp.float32)
     hit = closest_among(body, p, jnp.asarray(near[pick]))
     distance = np.asarray(signed_distance(body, p, closest=hit))[:count]
-    normals = np.asarray(vertex_normals(body.vertices, body.faces))
+    normals = vertex_normals(np.asarray(body.vertices), np.asarray(body.faces))
     tri = faces[np.asarray(hit.face)[:count]]
     away = np.einsum("pk,pkc->pc", np.asarray(hit.weights)[:count], normals[tri])
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
@@ -160,7 +160,7 @@ def bridge_hollows(
     for _ in range(iterations):
         distance, away = clearance(body, v)
         step = average @ v - v
-        normals = np.asarray(vertex_normals(jnp.asarray(v, jnp.float32), jnp.asarray(faces)))
+        normals = vertex_normals(v, faces)
         outwards = np.maximum(np.einsum("vc,vc->v", step, normals), 0.0)
         # In deep folds the skin's normals cross: vertices move along the cloth's, by half.
         headroom = np.clip((farthest - distance) / 0.002, 0.0, 1.0)
@@ -205,8 +205,7 @@ def relax_crossings(
             v += region[:, None] * (average @ v - v)
         for _ in range(4):
             deficit = np.maximum(nearest - clearance(body, v)[0], 0.0) * (region > 0)
-            normals = vertex_normals(jnp.asarray(v, jnp.float32), jnp.asarray(faces))
-            v += deficit[:, None] * np.asarray(normals)
+            v += deficit[:, None] * vertex_normals(v, faces)
     return v
 
 
@@ -233,8 +232,8 @@ def lift_over(
     """
     v = np.asarray(vertices, np.float64).copy()
     average = smoothing_matrix(faces, len(v))
-    normals = np.asarray(vertex_normals(under.vertices, under.faces), np.float64)
     skin, triangles = np.asarray(under.vertices, np.float64), np.asarray(under.faces)
+    normals = vertex_normals(skin, triangles)
     for step in range(passes):
         hit = closest_points(under, jnp.asarray(v, jnp.float32))
         corners, share = triangles[np.asarray(hit.face)], np.asarray(hit.weights, np.float64)

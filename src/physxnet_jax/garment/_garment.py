@@ -140,8 +140,12 @@ class Garment:
         References:
             MakeHuman's mhclo files attach clothes in the same way.
         """
-        carried = rest[self.refs] * self.ref_weights[:, :, None]
-        return jnp.sum(carried, axis=1) + self.offset
+        return _carried(rest, self.refs, self.ref_weights, self.offset)
+
+
+@jax.jit
+def _carried(rest: Array, refs: Array, weights: Array, offset: Array) -> Array:
+    return jnp.sum(rest[refs] * weights[:, :, None], axis=1) + offset
 
 
 @jax.jit

@@ -87,7 +87,7 @@ def _compute(body: Body) -> dict[str, PosedBody]:
         limbs = _limbs(
             body, *(np.einsum("jab,jb->ja", rotations, a) + translations for a in (heads, tails))
         )
-        normals = np.asarray(vertex_normals(skin.vertices, skin.faces), np.float64)
+        normals = vertex_normals(np.asarray(skin.vertices, np.float64), np.asarray(skin.faces))
         tree = KDTree(np.asarray(skin.vertices))
         out[name] = PosedBody(name, skin, tree, normals, limbs, rotations, translations)
     return out

@@ -25,6 +25,7 @@ from ._laplacian import (
     cotangent_laplacian as cotangent_laplacian,
     mesh_laplacian as mesh_laplacian,
 )
+from ._materialize import materialize as materialize
 from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
 from ._normals import vertex_normals as vertex_normals
 from ._padding import pad_rows as pad_rows, padded_rows as padded_rows

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..typing import pytree
+from ._materialize import materialize
 from ._mesh import TriMesh
 from ._normals import face_normals, vertex_normals
 from ._rotation import safe_normalize
@@ -94,6 +95,8 @@ def closest_barycentric(
     squared = _dot(gap, gap)
     inside = (det > _MIN_SQUARE) & (v_in > 0) & (w_in > 0) & (v_in + w_in < 1) & (squared <= best)
     v, w = xp.where(inside, v_in, v), xp.where(inside, w_in, w)
+    if xp is jnp:
+        v, w = materialize((v, w))
     return xp.stack([1 - v - w, v, w]), xp.where(inside, squared, best)
 
 
@@ -217,7 +220,7 @@ def _nearest_middles(
 ) -> Int[Array, "points count"]:
     """Those of each point's candidates whose middles are nearest."""
     order = candidates.T
-    middles = jax.lax.optimization_barrier(jnp.sum(corners.reshape(-1, 3, 3), axis=1) / 3.0)
+    middles = materialize(jnp.sum(corners.reshape(-1, 3, 3), axis=1) / 3.0)
     x, y, z = (m[order] - q[None] for m, q in zip(middles.T, p, strict=True))
     return nearest_distinct(x * x + y * y + z * z, order, count).T
 
@@ -230,7 +233,7 @@ def _nearest(
     """The nearest of each point's candidates; ties go to the first."""
     # One array per coordinate, points last: CPUs vectorise this if the copies are made first.
     order = candidates.T
-    copies = jax.lax.optimization_barrier(jnp.stack([c[order] for c in corners.T]))
+    copies = materialize(jnp.stack([c[order] for c in corners.T]))
     a, b, c = copies.reshape(3, 3, *order.shape)
     _, squared = closest_barycentric(jnp.broadcast_to(p[:, None], a.shape), a, b, c)
     near = fast_argmin(squared, axis=0)
@@ -244,8 +247,8 @@ def fast_argmin(values: Float[Array, "rows columns"], *, axis: int = 1) -> Int[A
     is a NaN, the result is the last index.
     """
     index = jax.lax.broadcasted_iota(jnp.int32, values.shape, axis)
-    # Without the barrier, recomputed values could round differently and equal no minimum.
-    values = jax.lax.optimization_barrier(values)
+    # Values computed twice could round differently and equal no minimum.
+    values = materialize(values)
     smallest = jnp.min(values, axis=axis, keepdims=True)
     return jnp.min(jnp.where(values <= smallest, index, values.shape[axis] - 1), axis=axis)
 

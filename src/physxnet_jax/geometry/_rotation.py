@@ -1,17 +1,19 @@
 """Rotations: unit quaternions (wxyz), matrices, axis-angle. Smooth at the identity."""
 
+from typing import Any, TypeVar
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+_A = TypeVar("_A", Array, np.ndarray)
+
 # Below this squared angle [rad^2] the series replaces sin(x)/x: the error is under 1e-9.
 _SMALL = 1e-6
 
 
-def safe_normalize(
-    vectors: Float[Array, "*batch n"], *, eps: float = 1e-12
-) -> Float[Array, "*batch n"]:
+def safe_normalize(vectors: Float[_A, "*batch n"], *, eps: float = 1e-12) -> Float[_A, "*batch n"]:
     """Unit vectors along the last axis; the zero vector stays zero.
 
     Value and gradient are finite everywhere: vectors no longer than ``eps`` become zero,
@@ -22,12 +24,13 @@ def safe_normalize(
         eps: Length under which a vector counts as zero [same unit].
 
     Returns:
-        Vectors of length one (or zero).
+        Vectors of length one (or zero). NumPy arrays give NumPy arrays.
     """
-    squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
+    xp: Any = np if isinstance(vectors, np.ndarray) else jnp
+    squared = xp.sum(vectors * vectors, axis=-1, keepdims=True)
     tiny = squared <= eps * eps
-    length = jnp.sqrt(jnp.where(tiny, jnp.ones_like(squared), squared))
-    return jnp.where(tiny, jnp.zeros_like(vectors), vectors / length)
+    length = xp.sqrt(xp.where(tiny, xp.ones_like(squared), squared))
+    return xp.where(tiny, xp.zeros_like(vectors), vectors / length)
 
 
 def safe_norm(vectors: Float[Array, "*batch n"]) -> Float[Array, "*batch"]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -32,13 +33,18 @@ class Stencil:
 
     def __matmul__(self, values: Float[Array, "*batch rows channels"]) -> Array:
         """The means, of the same shape as the values."""
-        # Gathering whole rows of a batch at once takes far fewer, longer copies.
-        rows = jnp.moveaxis(values, -2, 0)
-        wide = rows.reshape(rows.shape[0], -1)
-        out = jnp.zeros_like(wide)
-        for k in range(self.index.shape[1]):
-            out = out + self.weight[:, k, None] * wide[self.index[:, k]]
-        return jnp.moveaxis(out.reshape(rows.shape), 0, -2)
+        return _means(self.index, self.weight, values)
+
+
+@jax.jit
+def _means(index: Array, weight: Array, values: Array) -> Array:
+    # Gathering whole rows of a batch at once takes far fewer, longer copies.
+    rows = jnp.moveaxis(values, -2, 0)
+    wide = rows.reshape(rows.shape[0], -1)
+    out = jnp.zeros_like(wide)
+    for k in range(index.shape[1]):
+        out = out + weight[:, k, None] * wide[index[:, k]]
+    return jnp.moveaxis(out.reshape(rows.shape), 0, -2)
 
 
 def gaussian_stencil(

@@ -1,6 +1,7 @@
 """Preparation of motions for dressing and simulation: loading, resampling, slicing."""
 
 import dataclasses
+import numbers
 import pathlib
 from collections.abc import Mapping
 from typing import Literal
@@ -83,8 +84,10 @@ def slice_motion(clip: Motion, start: float, frames: int | None) -> tuple[Motion
     Raises:
         MotionError: Fewer than one frame is requested, or the start is outside the motion.
     """
-    if frames is not None and frames < 1:
-        raise MotionError(f"frames is {frames}; it must be at least one.")
+    if frames is not None and not (isinstance(frames, numbers.Integral) and frames >= 1):
+        raise MotionError(f"frames is {frames!r}; it must be a whole number of at least one.")
+    if not isinstance(start, numbers.Real):
+        raise MotionError(f"start is {start!r}; it must be a number of seconds.")
     first = start * clip.fps
     if not 0.0 <= first < clip.num_frames:
         raise MotionError(

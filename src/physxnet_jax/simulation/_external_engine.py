@@ -8,7 +8,6 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
@@ -115,7 +114,7 @@ def _max_depth(
     for k, (x, s) in enumerate(zip(cloth, skin, strict=True)):
         if not np.isfinite(x).all():
             continue
-        normal = np.asarray(vertex_normals(jnp.asarray(s), jnp.asarray(faces)))
+        normal = vertex_normals(s, faces)
         far, near = map(np.asarray, KDTree(s).query(x))
         inside = np.einsum("vi,vi->v", x - s[near], normal[near]) < 0
         out[k] = np.max(far, where=inside, initial=0.0)

@@ -222,7 +222,7 @@ def _hits(
     mesh: TriMesh, garment: Garment, rows: Int[np.ndarray, " rows"]
 ) -> tuple[Bool[np.ndarray, " rows"], Int[np.ndarray, " rows"], Float[np.ndarray, "rows 3"]]:
     """Which vertices' rays meet the skin, and the face and weights of the hit or closest point."""
-    normals = np.asarray(vertex_normals(garment.mesh.vertices, garment.mesh.faces))[rows]
+    normals = vertex_normals(*map(np.asarray, (garment.mesh.vertices, garment.mesh.faces)))[rows]
     points = np.asarray(garment.mesh.vertices)[rows]
     face, weights, squared = _closest(mesh, points)
     reach = _MAX_DISTANCE_RATIO * np.sqrt(squared) + 0.01

@@ -171,12 +171,13 @@ def make_collider(
         middle = np.searchsorted(rows, np.asarray(skirt.middles)).astype(np.int32)
         around = local[table.size :].reshape(skirt.table.shape).astype(np.int32)
         skirt = dataclasses.replace(skirt, middles=jnp.asarray(middle), table=jnp.asarray(around))
-    own, normals, weights = _picked_skin(mesh.vertices, mesh.faces, body.weights, pick)
+    own = np.asarray(mesh.vertices)
+    normals = vertex_normals(own, faces)
     return BodyCollider(
         pick,
-        own,
-        normals,
-        weights,
+        jnp.asarray(own[rows]),
+        jnp.asarray(normals[rows]),
+        body.weights[pick],
         jnp.asarray(corners.reshape(-1, 3).astype(np.int32)),
         jnp.asarray(np.searchsorted(rows, places).astype(np.int32)),
         jnp.asarray(choices.astype(np.int32)),
@@ -186,14 +187,6 @@ def make_collider(
         skirt,
         carry,
     )
-
-
-@jax.jit
-def _picked_skin(
-    vertices: Array, faces: Array, weights: Array, pick: Array
-) -> tuple[Array, Array, Array]:
-    """Positions, normals and skinning weights of some skin vertices."""
-    return vertices[pick], vertex_normals(vertices, faces)[pick], weights[pick]
 
 
 def _sample_places(

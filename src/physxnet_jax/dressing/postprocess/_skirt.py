@@ -94,8 +94,8 @@ def make_skirt_collider(
     skin = np.asarray(rest)[:NUM_BODY_VERTICES]
     points = np.asarray(garment.vertices)
     rows = hanging_vertices(body, np.asarray(rest), points)
-    normals = carry @ vertex_normals(garment.vertices, garment.faces)
-    outward = np.asarray(safe_normalize(normals))[rows]
+    normals = vertex_normals(points, np.asarray(garment.faces))
+    outward = safe_normalize(np.asarray(carry @ jnp.asarray(normals)))[rows]
     # In some files faces are oriented inward.
     if len(rows):
         middle = points[rows].mean(axis=0) * [1, 0, 1]

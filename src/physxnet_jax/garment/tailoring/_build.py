@@ -159,7 +159,7 @@ def _free_distance(carrier: np.ndarray, faces: np.ndarray) -> Float[np.ndarray, 
         Ma, Bae and Choi, 3D medial axis point approximation using nearest neighbors and the normal
         field (2012).
     """
-    normals = np.asarray(vertex_normals(jnp.asarray(carrier, jnp.float32), jnp.asarray(faces)))
+    normals = vertex_normals(np.asarray(carrier), np.asarray(faces))
     out = np.empty(len(carrier))
     for i, (p, n) in enumerate(zip(carrier, normals)):
         away = carrier - p

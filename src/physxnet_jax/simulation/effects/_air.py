@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES, triangulate
 from ...errors import check_numbers
-from ...geometry import spread_points, vertex_faces, vertex_normals
+from ...geometry import materialize, spread_points, vertex_faces, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, PosedPoints, Prepared, SkinnedPoints
@@ -117,10 +117,10 @@ class Air(Effect):
             return None
         used, local = np.unique(near, return_inverse=True)
         rows = samples[used]
-        faces = jnp.asarray(np.asarray(triangulate(assembly.body.quads)))
+        faces = np.asarray(triangulate(assembly.body.quads))
         skinned_points = SkinnedPoints(
             float32(skin[rows]),
-            vertex_normals(float32(skin), faces)[jnp.asarray(rows)],
+            float32(vertex_normals(skin, faces)[rows]),
             assembly.body.weights[jnp.asarray(rows)],
         )
         return _Lee(skinned_points, jnp.asarray(local.reshape(near.shape).astype(np.int32)))
@@ -141,8 +141,8 @@ class _Lee:
         """Sheltering of each vertex, from 0 to 1, shape [vertices, 1, batch]."""
         way = np.asarray(wind) / np.linalg.norm(wind)
         gap = placed.points[self.near] - base[:, None]
-        # Keep XLA from recomputing this: the gradient of `min` compares for equality.
-        squared = jax.lax.optimization_barrier(jnp.sum(gap * gap, axis=2))
+        # Computed once: the gradient of `min` compares for equality.
+        squared = materialize(jnp.sum(gap * gap, axis=2))
         facing = jnp.sum(placed.normals * jnp.asarray(way, base.dtype)[None, :, None], axis=1)
         least = jnp.min(squared, axis=1, keepdims=True)
         # Average the normals of all nearly closest samples; a single one would cause jumps.

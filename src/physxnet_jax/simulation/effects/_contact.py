@@ -14,6 +14,7 @@ from ...body import NUM_BODY_VERTICES, triangulate
 from ...errors import check_counts, check_numbers
 from ...geometry import (
     closest_barycentric,
+    materialize,
     mesh_edges,
     vertex_normals,
 )
@@ -108,14 +109,14 @@ class BodyContact(Effect):
         ring = KDTree(skin[used]).query(skin[used], k=min(self.ring, len(used)))[1]
         local = np.zeros(len(skin), dtype=np.int32)
         local[used] = np.arange(len(used))
-        normals = vertex_normals(float32(skin), jnp.asarray(faces))
+        normals = vertex_normals(skin, faces)
         skinned_points = SkinnedPoints(
-            float32(skin[used]), normals[jnp.asarray(used)], body.weights[jnp.asarray(used)]
+            float32(skin[used]), float32(normals[used]), body.weights[jnp.asarray(used)]
         )
         return _Contact(
             samples,
             skinned_points,
-            float32(np.stack([relief(skin, np.asarray(normals), r)[used] for r in reaches], 1)),
+            float32(np.stack([relief(skin, normals, r)[used] for r in reaches], 1)),
             jnp.asarray(part.astype(np.int32)),
             jnp.asarray(ring.reshape(len(used), -1).T.astype(np.int32)),
             jnp.asarray(near.T.astype(np.int32)),
@@ -373,7 +374,7 @@ class _Contact(Prepared):
         vertices = len(base) - self.samples.count
         # In two parts, because samples are pushed after the vertices.
         own, beside = (
-            jax.lax.optimization_barrier(jax.tree.map(lambda x, rows=rows: x[rows], surface))
+            materialize(jax.tree.map(lambda x, rows=rows: x[rows], surface))
             for rows in (slice(vertices), slice(vertices, None))
         )
         return _Touch(own, beside, centre, later, margin, far, unit, ceiling)
@@ -415,13 +416,11 @@ class _Contact(Prepared):
         moved, _ = self._pushed(displacement, start, context.surface, progress, step, vertices)
         moved = displacement + (moved - displacement) * self.free[..., None]
         if self.samples.count:
-            # Barriers: XLA would compute and gather anew for each use.
-            apart = jax.lax.optimization_barrier
-            moved = apart(moved)
-            at, before = apart((self.samples.points(moved), self.samples.points(start)))
+            moved = materialize(moved)
+            at, before = materialize((self.samples.points(moved), self.samples.points(start)))
             rest = slice(len(displacement), None)
             pushed, lift = self._pushed(at, before, context.beside, progress, step, rest)
-            move, acts = apart((pushed - at, (lift != 0).astype(at.dtype)))
+            move, acts = materialize((pushed - at, (lift != 0).astype(at.dtype)))
             moved = self.samples.push(moved, move, acts, self.free)
         return moved
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ...geometry import closest_barycentric, nearest_distinct, nearest_index
+from ...geometry import closest_barycentric, materialize, nearest_distinct, nearest_index
 
 # Triangles of a patch that are compared exactly: those with the nearest middles.
 _EXACT = 3
@@ -53,14 +53,12 @@ def nearest_face(
         faces: All triangles.
         patch: Indices of each point's candidates.
     """
-    # Arithmetic that is fused with gathers isn't vectorised.
-    apart = jax.lax.optimization_barrier
     p = jnp.moveaxis(points, 1, 0)
-    middles = apart((x[faces[:, 0]] + x[faces[:, 1]] + x[faces[:, 2]]) / 3.0)
+    middles = materialize((x[faces[:, 0]] + x[faces[:, 1]] + x[faces[:, 2]]) / 3.0)
     few = patch
     if len(patch) > _EXACT:
         a, b, c = (m - q[None] for m, q in zip(gather(middles, patch), p, strict=True))
         few = nearest_distinct(a * a + b * b + c * c, patch, _EXACT)
-    tri = apart(gather_corners(x, faces[few], axis=-1))
+    tri = materialize(gather_corners(x, faces[few], axis=-1))
     _, squared = closest_barycentric(jnp.broadcast_to(p[:, None], tri[0].shape), *tri)
-    return jnp.take_along_axis(few, nearest_index(apart(squared))[None], axis=0)[0]
+    return jnp.take_along_axis(few, nearest_index(materialize(squared))[None], axis=0)[0]

@@ -10,11 +10,10 @@ import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
 
 from ...errors import check_numbers
-from ...geometry import pad_rows, patch_shares
+from ...geometry import materialize, pad_rows, patch_shares
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, Prepared, Rest, Step
-from ._gather import gather
 
 # Vertices over which the mean of a patch is taken.
 _MEMBERS = 128
@@ -102,9 +101,8 @@ class PreparedGuide(Prepared):
 
     def spread(self, moves: Float[Array, "patches 3 batch"]) -> Float[Array, "vertices 3 batch"]:
         """Moves of patches, interpolated at the vertices."""
-        rows = jnp.broadcast_to(self.back[..., None], (*self.back.shape, moves.shape[2]))
-        share = self.back_weight[..., None]
-        return jnp.stack([jnp.sum(share * m, axis=0) for m in gather(moves, rows)], axis=1)
+        share = self.back_weight[..., None, None]
+        return jnp.sum(share * materialize(moves)[self.back], axis=0)
 
     def reshaped(self, rest: Rest) -> Prepared:
         # Patches are of vertices, and weigh them as they were.

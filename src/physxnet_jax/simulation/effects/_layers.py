@@ -1,6 +1,7 @@
 """Contact between garments in layers, in the order of the scene."""
 
 import dataclasses
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES
 from ...errors import check_counts, check_numbers
-from ...geometry import mesh_edges
+from ...geometry import materialize, mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly, float32
 from .._effect import Clock, Effect, Prepared, Step
@@ -115,6 +116,7 @@ class LayerContact(Effect):
                 side.append(np.full(len(own_vertices), 1.0 if a > b else -1.0))
         if not rows:
             rows, start, side = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
+        pair = _pairs_of(rows, len(x))
         return _Layers(
             jnp.asarray(np.concatenate(rows).astype(np.int32)),
             jnp.asarray(np.concatenate(start).astype(np.int32)),
@@ -126,9 +128,23 @@ class LayerContact(Effect):
             jnp.asarray(label.astype(np.int32)),
             jnp.asarray(adjoining()),
             jnp.asarray(inverse_mass)[:, None, None],
+            jnp.asarray(np.maximum(pair, 0)),
+            float32((pair >= 0)[..., None, None]),
             self,
-            (0, *(int(n) for n in np.cumsum([len(r) for r in rows]))),
         )
+
+
+def _pairs_of(
+    rows: Sequence[Int[np.ndarray, " _"]], vertices: int
+) -> Int[np.ndarray, "others vertices"]:
+    """Pairs of each vertex, of which it has at most one in each block of rows; -1 for none."""
+    out = np.full((len(rows), vertices), -1, np.int32)
+    first = np.cumsum([0, *(len(r) for r in rows)])
+    for k, r in enumerate(rows):
+        out[k, r] = first[k] + np.arange(len(r))
+    # A garment has pairs with the others alone: pairs first, then as many rows as are needed.
+    out = -np.sort(-out, axis=0)
+    return out[: max(int((out >= 0).sum(axis=0).max(initial=0)), 1)]
 
 
 def _nearest(
@@ -153,8 +169,9 @@ class _Layers(ClothContact):
     label: Int[Array, " vertices"]
     adjoining: Array
     inverse_mass: Float[Array, "vertices 1 1"]
+    pair: Int[Array, "others vertices"]
+    has_pair: Float[Array, "others vertices 1 1"]
     law: LayerContact = dataclasses.field(metadata={"static": True})
-    blocks: tuple[int, ...] = dataclasses.field(metadata={"static": True})
 
     def init_state(self, batch: int) -> Int[Array, "pairs batch"]:
         return jnp.repeat(self.start[:, None], batch, axis=1)
@@ -201,6 +218,8 @@ class _Layers(ClothContact):
         progress: Array,
         step: Step,
     ) -> Array:
+        if not self.rows.size:
+            return displacement
         pairs, law = context.pairs, self.law
         n, weights = pairs.normal, pairs.weights
         mine = self.inverse_mass[self.rows]
@@ -218,12 +237,7 @@ class _Layers(ClothContact):
             length = jnp.sqrt(jnp.sum(slide * slide, axis=1, keepdims=True) + 1e-18)
             move = move - jnp.minimum(1.0, law.friction * depth / length) * slide
         move = share * move
-        for i, j in zip(self.blocks, self.blocks[1:]):
-            rows = self.rows[i:j]
-            displacement = displacement.at[rows].add(
-                move[i:j], unique_indices=True, indices_are_sorted=True
-            )
-        return displacement
+        return displacement + jnp.sum(self.has_pair * materialize(move)[self.pair], axis=0)
 
     def diagnose(self, displacement: Array, context: Facing) -> dict[str, Array]:
         pairs = context.pairs

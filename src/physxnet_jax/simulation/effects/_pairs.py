@@ -3,14 +3,13 @@
 import dataclasses
 from typing import Any, Protocol, runtime_checkable
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from ...geometry import closest_barycentric
+from ...geometry import closest_barycentric, materialize
 from ...typing import pytree
 from .._effect import Clock, Prepared, Step
-from ._gather import gather, gather_corners, nearest_face
+from ._gather import gather_corners, nearest_face
 
 # Pairs that are too close approach their gap within this time [s].
 _SETTLING = 0.1
@@ -107,7 +106,12 @@ class ClothContact(Prepared):
 
 def rows_of(x: Float[Array, "vertices 3 batch"], index: Int[Array, "... batch"]) -> Array:
     """Rows of each batch member, shape [..., 3, batch]."""
-    return jnp.stack(gather(x, index), axis=-2)
+    return jnp.swapaxes(_rows(x, index), -1, -2)
+
+
+def _rows(x: Float[Array, "vertices 3 batch"], index: Int[Array, "... batch"]) -> Array:
+    """`rows_of` with coordinates last: as they lie in memory, for a batch of one."""
+    return jnp.swapaxes(x, 1, 2)[index, jnp.arange(x.shape[2])]
 
 
 def closest_of(
@@ -118,13 +122,13 @@ def closest_of(
 ) -> tuple[Array, Array]:
     """The closest of k triangles for each point: corners and weights, [3, pairs, batch]."""
     corners = jnp.moveaxis(faces[nearest_face(points, x, faces, patch)], -1, 0)
-    tri = jax.lax.optimization_barrier(gather_corners(x, corners, axis=0))
+    tri = materialize(gather_corners(x, corners, axis=0))
     return corners, closest_barycentric(jnp.moveaxis(points, 1, 0), *tri)[0]
 
 
 def foot_of(x: Float[Array, "vertices 3 batch"], corners: Array, weights: Array) -> Array:
     """Points on triangles, shape [pairs, 3, batch]."""
-    return sum(w[:, None] * rows_of(x, c) for w, c in zip(weights, corners, strict=True))  # pyright: ignore[reportReturnType]
+    return jnp.swapaxes(jnp.sum(weights[..., None] * _rows(x, corners), axis=0), 1, 2)
 
 
 def wanted_height(

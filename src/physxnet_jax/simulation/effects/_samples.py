@@ -3,12 +3,11 @@
 import dataclasses
 import math
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ...geometry import mesh_edges
+from ...geometry import materialize, mesh_edges
 from ...typing import pytree
 from .._assembly import Assembly, float32
 
@@ -61,7 +60,7 @@ class Samples:
             acts: 1 for samples that act, else 0.
             free: 1 for vertices that can move, 0 for held ones.
         """
-        rows = jax.lax.optimization_barrier(jnp.concatenate([acts * move, acts], axis=1))
+        rows = materialize(jnp.concatenate([acts * move, acts], axis=1))
         total = jnp.zeros((len(x), *rows.shape[1:]), x.dtype)
         for corner, share, counts in zip(self.corners, self.shares, self.counts, strict=True):
             weight = jnp.stack([share, share, share, counts], axis=1)[..., None]
