@@ -184,11 +184,11 @@ def cloth_by(method: str, garments, motion: Motion) -> tuple[np.ndarray, ...]:
 
 def scenes():
     """A soft action, an abrupt one, and a garment file where there is one."""
-    yield "salsa", (tailor("trousers"), tailor("shirt")), clip("salsa", 60), (20, 40, 59)
-    yield "punch", (tailor("aline"),), clip("punch", 60), (15, 30, 45)
+    yield "salsa", (tailor("trousers"), tailor("shirt")), clip("salsa", 60), (20, 59)
+    yield "punch", (tailor("aline"),), clip("punch", 60), (15, 45)
     file = shared() / "garments/longsleeve.obj"
     if file.is_file():
-        yield "longsleeve.obj", (load_garment(file)[0],), clip("punch", 60), (15, 30, 45)
+        yield "longsleeve.obj", (load_garment(file)[0],), clip("punch", 60), (15, 45)
 
 
 def look() -> None:

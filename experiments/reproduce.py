@@ -92,7 +92,7 @@ ABRUPT = ("strong gesture", "jump", "punch")
 COPIED = (
     *("oracle", "accuracy_cost", "peers", "engines", "training"),
     *("blender_import", "blender_extension", "layers", "adapt", "unseen", "laptop"),
-    *("losses", "guided"),
+    *("losses", "guided", "standing"),
 )
 DOCUMENTS = (
     *("docs/reproduction.md", "docs/accuracy-cost.md", "docs/garments.md"),

@@ -4,7 +4,7 @@ Command: bash experiments/cuda/run.sh learn [--seconds 760] [--toy]
 Cost:    the seconds, on an H100 or H200 with 16 cores; with --toy minutes on two cores.
 Result:  $OUT/learned.json, rows by role, and the weights in pieces under 16 MB.
 
-    clothes   each default garment on all training actions and on five variations of them, side by
+    clothes   each default garment on all training actions and on six variations of them, side by
               side on the card: other upper bodies, speeds, wider poses, the frames left out
     variants  the outfits of datasets.toml#variants, on the processor's cores meanwhile
     paper     fitted garments on the card, then the paper's network, 256 x 256
@@ -55,7 +55,15 @@ from physxnet_jax.data import (
 from physxnet_jax.files import write_json
 from physxnet_jax.garment import template
 from physxnet_jax.models import save_predictor
-from physxnet_jax.motion import Motion, animate, at_speed, exaggerated, save_motion, with_upper_body
+from physxnet_jax.motion import (
+    Motion,
+    animate,
+    at_speed,
+    exaggerated,
+    save_motion,
+    subdued,
+    with_upper_body,
+)
 from physxnet_jax.simulation import (
     XPBD,
     PreparedScene,
@@ -90,6 +98,7 @@ class Way:
 
     upper_from: int = 0
     exaggerate: float = 1.0
+    subdue: float = 1.0
     speed: float = 1.0
     left_out: bool = False
     """Whether what the protocol leaves out of the clips takes the place of the actions."""
@@ -102,6 +111,7 @@ WAYS = (
     Way(upper_from=5, speed=1.2),
     Way(upper_from=13, exaggerate=1.1, speed=0.85),
     Way(exaggerate=1.3),
+    Way(subdue=0.3),
 )
 
 
@@ -275,6 +285,8 @@ def _motions(
                     motion = with_upper_body(body, motion, load(folder, other))
                 if way.exaggerate != 1.0:
                     motion = exaggerated(motion, way.exaggerate)
+                if way.subdue != 1.0:
+                    motion = subdued(body, motion, way.subdue)
                 if way.speed != 1.0:
                     motion = at_speed(motion, way.speed)
                 motion = _cropped(motion)

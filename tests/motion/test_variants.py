@@ -16,10 +16,12 @@ from physxnet_jax.motion import (
     body_animation,
     exaggerated,
     extrapolate_history,
+    foot_heights,
     frames_at_speed,
     load_motion,
     mirror_joints,
     mirrored,
+    subdued,
     with_upper_body,
 )
 
@@ -109,6 +111,33 @@ def test_exaggeration_by_one_is_identity_and_a_large_one_is_bounded():
     assert (original.mean().inv() * turned).magnitude().max() < 2.61
     with pytest.raises(MotionError, match="positive"):
         exaggerated(motion, -1.0)
+
+
+@pytest.mark.parametrize("factor", [0.3, 1.0])
+def test_a_subdued_person_stands_on_the_floor_and_moves_less(factor):
+    motion, body = load_motion("walk", fps=30.0), load_body()
+    still = subdued(body, motion, factor)
+    for name in ("LeftUpLeg", "RightForeArm"):
+        joint = body.joint_names.index(name)
+        sizes = [
+            Rotation.from_quat(np.roll(np.asarray(m.rotations[:, joint]), -1, axis=1)).magnitude()
+            for m in (still, motion)
+        ]
+        np.testing.assert_allclose(sizes[0], factor * sizes[1], atol=1e-4)
+    ways = [np.ptp(np.asarray(m.root)[:, [0, 2]], axis=0) for m in (still, motion)]
+    np.testing.assert_allclose(ways[0], factor * ways[1], atol=1e-3)
+    rest = body.rest_vertices(body.default_shape())
+    np.testing.assert_allclose(foot_heights(body, still, rest), 0.0, atol=1e-4)
+    if factor == 1.0:
+        dots = np.abs(np.sum(np.asarray(still.rotations) * np.asarray(motion.rotations), axis=2))
+        np.testing.assert_allclose(dots, 1.0, atol=1e-5)
+
+
+def test_a_person_is_not_subdued_to_nothing_or_beyond_the_motion():
+    motion = load_motion("walk", fps=30.0)
+    for factor in (0.0, 1.5, float("nan")):
+        with pytest.raises(MotionError, match="more than 0 and at most 1"):
+            subdued(load_body(), motion, factor)
 
 
 def test_with_upper_body_keeps_the_legs_and_plays_back_and_forth():

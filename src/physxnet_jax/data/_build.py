@@ -26,6 +26,7 @@ from ..motion import (
     exaggerated,
     frames_at_speed,
     mirrored,
+    subdued,
     with_upper_body,
 )
 from ..simulation import (
@@ -268,7 +269,8 @@ def _note(config: DatasetConfig) -> dict[str, Any]:
 
 def _changes(config: DatasetConfig) -> dict[str, Any]:
     """Settings that differ from their defaults; datasets of earlier versions don't list them."""
-    names = ("left_out", "upper_from", "exaggerate", "people", "outfits_each", "first_outfit")
+    names = ("left_out", "upper_from", "exaggerate", "subdue")
+    names += ("people", "outfits_each", "first_outfit")
     changes = {k: getattr(config, k) for k in names}
     defaults = DatasetConfig()
     out = {k: v for k, v in changes.items() if v != getattr(defaults, k)}
@@ -367,7 +369,7 @@ def _store(
 def action_motion(
     config: DatasetConfig, action: Action, body: Body, folder: str | pathlib.Path
 ) -> Motion:
-    """Loads an action and applies the settings: upper body, exaggeration, mirror, speed."""
+    """Loads an action; upper body, exaggeration, subduing, mirror and speed as they are set."""
     motion = load_action(folder, action)
     if config.upper_from:
         split = [a for a in read_protocol(folder) if a.split == action.split]
@@ -376,6 +378,8 @@ def action_motion(
         motion = with_upper_body(body, motion, other)
     if config.exaggerate != 1.0:
         motion = exaggerated(motion, config.exaggerate)
+    if config.subdue != 1.0:
+        motion = subdued(body, motion, config.subdue)
     if config.mirror:
         motion = mirrored(body, motion)
     if config.speed != 1.0:

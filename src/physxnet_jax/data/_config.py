@@ -39,6 +39,7 @@ class DatasetConfig:
         upper_from: Take spine, arms and head from the action this many places further on in
             the same split; 0 disables this.
         exaggerate: Factor on the deviation of each joint from its mean rotation.
+        subdue: Factor that makes of every motion a person who stands almost still, see `subdued`.
         people: Actions simulated side by side, as one batch; with the ``physxnet`` engine. Part of
             the configuration because the last bits of a result depend on its batch.
         solver: Settings of this package's simulator.
@@ -56,12 +57,13 @@ class DatasetConfig:
     speed: float = 1.0
     upper_from: int = 0
     exaggerate: float = 1.0
+    subdue: float = 1.0
     people: int = 1
     solver: XPBD = dataclasses.field(default_factory=XPBD)
     blender: BlenderSettings = dataclasses.field(default_factory=BlenderSettings)
 
     def __post_init__(self) -> None:
-        check_numbers(self, "speed", "exaggerate")
+        check_numbers(self, "speed", "exaggerate", "subdue")
         for name, given, known in (
             ("splits", self.splits, SPLITS),
             ("templates", self.templates, TEMPLATES),

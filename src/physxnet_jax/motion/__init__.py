@@ -58,5 +58,6 @@ from ._variants import (
     frames_at_speed as frames_at_speed,
     mirror_joints as mirror_joints,
     mirrored as mirrored,
+    subdued as subdued,
     with_upper_body as with_upper_body,
 )

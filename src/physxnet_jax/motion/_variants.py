@@ -1,4 +1,4 @@
-"""Variants of a motion: mirrored, at another speed, exaggerated, with another upper body."""
+"""Variants of a motion: mirrored, faster, exaggerated, subdued, with another upper body."""
 
 import re
 
@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from ..body import Body
 from ..errors import MotionError
 from ._motion import Motion, check_joints, make_motion, sample
+from ._retarget import foot_heights
 
 # Limit of an exaggerated joint's angle from its mean [rad].
 _MAX_SWING = 2.6
@@ -104,6 +105,41 @@ def exaggerated(motion: Motion, factor: float) -> Motion:
         wider = (mean * Rotation.from_rotvec(swing)).as_quat()
         rotations[:, joint + 1] = np.roll(wider, 1, axis=1)
     return make_motion(rotations, motion.root, motion.fps, name=motion.name)
+
+
+def subdued(body: Body, motion: Motion, factor: float) -> Motion:
+    """Scales a motion down to a person who stands almost still: nobody captures those.
+
+    Every joint's angle from the rest pose, the lean of the root, its turns and its way along the
+    floor, each from their mean, are scaled. In every frame the lower foot is on the floor.
+
+    Args:
+        body: The body.
+        motion: The motion.
+        factor: Factor on all of them, more than 0 and at most 1.
+
+    Raises:
+        MotionError: Another factor.
+    """
+    if not 0 < factor <= 1:
+        raise MotionError(f"the factor is {factor}; it must be more than 0 and at most 1.")
+    quaternions = np.roll(np.asarray(motion.rotations, dtype=np.float64), -1, axis=2)
+    out = np.array(quaternions)
+    for joint in range(1, out.shape[1]):
+        swing = Rotation.from_quat(quaternions[:, joint]).as_rotvec()
+        out[:, joint] = Rotation.from_rotvec(factor * swing).as_quat()
+    root = Rotation.from_quat(quaternions[:, 0])
+    ahead = root.apply([0.0, 0.0, 1.0])
+    heading = np.unwrap(np.arctan2(ahead[:, 0], ahead[:, 2]))
+    lean = (Rotation.from_euler("y", heading[:, None]).inv() * root).as_rotvec()
+    heading = heading.mean() + factor * (heading - heading.mean())
+    leaned = Rotation.from_euler("y", heading[:, None]) * Rotation.from_rotvec(factor * lean)
+    out[:, 0] = leaned.as_quat()
+    place = np.asarray(motion.root, dtype=np.float64)
+    place = place.mean(axis=0) + factor * (place - place.mean(axis=0))
+    still = make_motion(np.roll(out, 1, axis=2), place, motion.fps, name=motion.name)
+    place[:, 1] -= foot_heights(body, still, body.rest_vertices(body.default_shape()))
+    return make_motion(still.rotations, place, motion.fps, name=motion.name)
 
 
 def with_upper_body(body: Body, motion: Motion, other: Motion) -> Motion:
