@@ -140,12 +140,9 @@ class Garment:
         References:
             MakeHuman's mhclo files attach clothes in the same way.
         """
-        return _carried(rest, self.refs, self.ref_weights, self.offset)
-
-
-@jax.jit
-def _carried(rest: Array, refs: Array, weights: Array, offset: Array) -> Array:
-    return jnp.sum(rest[refs] * weights[:, :, None], axis=1) + offset
+        carried = rest[self.refs] * self.ref_weights[:, :, None]
+        # Not as one program, which would round otherwise than where the offsets were made.
+        return jnp.sum(carried, axis=1) + self.offset
 
 
 @jax.jit
