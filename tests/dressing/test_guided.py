@@ -158,6 +158,8 @@ def test_people_side_by_side_do_not_see_each_other(guided, motion, apart):
     np.testing.assert_array_equal(twice[0], together[0])
     for k, pair in enumerate(pairs):
         alone = cloth_of(guided, *pair)["bottom"]
+        np.testing.assert_allclose(together[k][0], alone[0], atol=1e-3)
+        # Later the two programs' rounding decides a few contacts.
         assert np.mean(np.abs(together[k][:3] - alone[:3]) > 1e-3) < 0.005
         other = cloth_of(guided, *pairs[1 - k])["bottom"]
         for frame in range(3):

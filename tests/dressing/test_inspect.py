@@ -348,14 +348,16 @@ def test_displaced_garments_are_aligned_to_their_template(name, change, tmp_path
     write_obj(path, x, np.asarray(mesh.faces))
     found = inspect_garment(path)
     if change != "too small":
-        # Fitted trousers lie on the skin: a centimetre is enough to put some of them into it.
         assert found.template == name and found.notes and found.inside < 0.05
+        # Fitted trousers lie on the skin: a centimetre is enough to put some of them into it.
+        assert not found.problems or (name, change) == ("bottom", "aside")
         placed = np.asarray(load_garment(path)[0].mesh.vertices)
         away = np.linalg.norm(placed - np.asarray(mesh.vertices), axis=1)
         assert np.quantile(away, 0.95) < 0.02
         return
     # Refused or called ill-fitting, with the command that makes it fit.
-    assert f"--like {name}" in found.command and found.problems
+    said = " ".join(found.problems)
+    assert f"--like {name}" in found.command and ("elsewhere" in said or "no unit" in said)
     done, after = fit_garment(path, tmp_path / "b.obj", like=name)
     assert after.inside < 0.02 and after.template == name and done
 

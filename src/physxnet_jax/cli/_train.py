@@ -14,8 +14,10 @@ from ._experiment_commands import Train
 from ._progress import progress_bars
 
 # What a card records about each dataset.
-_CARD_KEYS = ("engine", "mirror", "speed", "left_out", "upper_from", "exaggerate", "subdue")
-_CARD_KEYS += ("fps", "quantum")
+_CARD_KEYS = (
+    *("engine", "mirror", "speed", "left_out", "upper_from", "exaggerate", "subdue"),
+    *("fps", "quantum"),
+)
 
 
 def train(command: Train, console: Console) -> int:

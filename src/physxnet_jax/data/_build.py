@@ -269,8 +269,10 @@ def _note(config: DatasetConfig) -> dict[str, Any]:
 
 def _changes(config: DatasetConfig) -> dict[str, Any]:
     """Settings that differ from their defaults; datasets of earlier versions don't list them."""
-    names = ("left_out", "upper_from", "exaggerate", "subdue")
-    names += ("people", "outfits_each", "first_outfit")
+    names = (
+        *("left_out", "upper_from", "exaggerate", "subdue"),
+        *("people", "outfits_each", "first_outfit"),
+    )
     changes = {k: getattr(config, k) for k in names}
     defaults = DatasetConfig()
     out = {k: v for k, v in changes.items() if v != getattr(defaults, k)}
