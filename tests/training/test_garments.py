@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax import nnx
 
 from physxnet_jax.body import load_body
 from physxnet_jax.data import (
@@ -22,7 +23,7 @@ from physxnet_jax.dressing import Inference, clothe, clothe_step, init_stream, m
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.garment import tailor
 from physxnet_jax.geometry import mesh_edges, patch_shares
-from physxnet_jax.models import ModelConfig, load_predictor, save_predictor
+from physxnet_jax.models import ModelConfig, load_predictor, make_generator, save_predictor
 from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import elastic_tables
 from physxnet_jax.training import LossInputs, TrainConfig, train
@@ -84,7 +85,7 @@ def test_tables_sample_as_bindings_do():
         np.testing.assert_allclose(got[k, :n], binding.sample(values[k][None])[0], atol=1e-5)
         assert float(tables["top"].present[k].sum()) == n
     with pytest.raises(FormatError, match="no 'bottom' in the data"):
-        prepare_garments(dataclasses.replace(MODEL, templates=("bottom",)), wardrobe)
+        prepare_garments(MODEL, make_wardrobe([TIGHT], ("top", "bottom")))
 
 
 @pytest.mark.release
@@ -194,6 +195,49 @@ def test_training_goes_on_from_weights_and_lowers_their_elastic_energy(learned, 
     other = dataclasses.replace(onward, model=dataclasses.replace(MODEL, width=8))
     with pytest.raises(PhysXNetError, match="another model"):
         train(other, data, tmp_path / "other")
+
+
+@pytest.mark.release
+def test_decoders_that_are_not_learned_stay(learned, tmp_path):
+    model = dataclasses.replace(MODEL, templates=("top", "bottom"))
+    graph, state = nnx.split(make_generator(model, seed=3))
+    points, scales = learned.texel_points, learned.normalisation
+    before = dataclasses.replace(
+        learned,
+        config=model,
+        graph=graph,
+        state=state,
+        texel_points=dataclasses.replace(
+            points, valid=dict.fromkeys(model.templates, points.valid["top"])
+        ),
+        normalisation=dataclasses.replace(
+            scales, offset=dict.fromkeys(model.templates, scales.offset["top"])
+        ),
+    )
+    save_predictor(tmp_path / "w", before, name="w")
+    config = dataclasses.replace(
+        CONFIG,
+        model=model,
+        start=str(tmp_path / "w"),
+        learned=("top",),
+        epochs=1,
+        elastic_weight=1e-4,
+    )
+    assert config.templates == ("top",)
+    after = train(config, [sequence(TIGHT, 0.0), sequence(LOOSE, -OFF)], tmp_path / "run")
+    was, now = (
+        dict(nnx.to_flat_state(p.state)) for p in (load_predictor(str(tmp_path / "w")), after)
+    )
+    changed = {k for k in was if not np.array_equal(was[k][...], now[k][...])}
+    assert changed == {k for k in was if k[:2] == ("decoders", "top") and not is_statistic(was[k])}
+    assert set(after.texel_points.valid) == set(model.templates)
+    for given in ({"learned": ("dress",)}, {"start": ""}):
+        with pytest.raises(ValueError, match="learned is"):
+            dataclasses.replace(config, **given)
+
+
+def is_statistic(value):
+    return isinstance(value, nnx.BatchStat)
 
 
 def energy_of(weights):

@@ -47,6 +47,9 @@ class TrainConfig:
         mirror_augmentation: Also train on the mirror image of every action.
         start: Weights to go on from, a name or a folder, with their scales of inputs and outputs;
             random ones if empty.
+        learned: Templates whose decoders alone are learned, in evaluation mode: the encoder, other
+            decoders and batch statistics stay those of ``start``, and the data need hold no other
+            garments. Everything is learned if empty. Only with ``model.conditions``.
         seed: Seed of all random numbers.
         precision: Precision of the network's arithmetic; parameters and losses stay float32.
         validation: Names of training actions that are held out for validation. The weights
@@ -80,6 +83,7 @@ class TrainConfig:
     discriminator_width: int = 16
     mirror_augmentation: bool = False
     start: str = ""
+    learned: tuple[str, ...] = ()
     seed: int = 0
     precision: Literal["float32", "bfloat16"] = "float32"
     validation: tuple[str, ...] = ()
@@ -121,9 +125,20 @@ class TrainConfig:
             raise ValueError(
                 "pyramid_levels above 1 needs loss='l1', but loss is 'l2'; choose one."
             )
+        unknown = set(self.learned) - set(self.model.templates)
+        if unknown or (self.learned and not (self.start and self.model.conditions)):
+            raise ValueError(
+                f"learned is {self.learned}; it names templates of model.templates, and needs"
+                " model.conditions and weights to start from."
+            )
         size = self.model.resolution
         if self.pyramid_levels < 1 or size % 2 ** (self.pyramid_levels - 1):
             raise ValueError(
                 f"pyramid_levels is {self.pyramid_levels}; it must be at least 1, and maps of"
                 f" {size} must halve that often."
             )
+
+    @property
+    def templates(self) -> tuple[str, ...]:
+        """Templates that are learned, in the order of the model."""
+        return tuple(t for t in self.model.templates if not self.learned or t in self.learned)

@@ -53,7 +53,7 @@ def load_data(config: TrainConfig, sequences: Items[Sequence | Where | Entry]) -
     """
     body, model = load_body(), config.model
     entries = [read_entry(s) for s in sequences]
-    wardrobe = make_wardrobe([e.outfit for e in entries], model.templates)
+    wardrobe = make_wardrobe([e.outfit for e in entries], config.templates)
     if not model.conditions and any(wardrobe.outfits):
         raise FormatError("these data hold outfits; learn from them with conditions = true.")
     held = _held_out(config, entries)
@@ -101,10 +101,10 @@ def load_data(config: TrainConfig, sequences: Items[Sequence | Where | Entry]) -
     atlas, motion_atlas, points, persons, garments = prepare_garments(
         model, wardrobe, elastic=config.elastic_weight > 0
     )
-    share = config.frames_in_memory // len(model.templates)
+    share = config.frames_in_memory // len(config.templates)
     each = {
         t: frames_of(dataclasses.replace(wardrobe, garments={t: wardrobe.garments[t]}), share)
-        for t in model.templates
+        for t in config.templates
     }
     known = {t: u for t, (_, u) in each.items() if u is not None}
     _check_usable(config, list(known.values()))

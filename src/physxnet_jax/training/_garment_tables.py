@@ -144,7 +144,7 @@ def prepare_garments(
         elastic: Whether the elastic energy of the garments is needed.
 
     Raises:
-        FormatError: The wardrobe lacks a template of the model.
+        FormatError: The wardrobe lacks a template that is learned.
     """
     body = load_body()
     rest = body.rest_vertices(body.default_shape())
@@ -152,8 +152,7 @@ def prepare_garments(
     motion_atlas = make_atlas(model.motion_resolution, skirt=True)
     every = jnp.ones(atlas.num_texels, bool)
     tables, valid = {}, {}
-    for name in model.templates:
-        garments = wardrobe.garments.get(name, ())
+    for name, garments in wardrobe.garments.items():
         if not garments:
             raise FormatError(f"no '{name}' in the data: simulate one, or drop the template.")
         bound = [bind(g, atlas=atlas, body=body, rest=rest, valid=every) for g in garments]

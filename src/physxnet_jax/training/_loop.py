@@ -39,7 +39,7 @@ _Report = Callable[[int, int, dict[str, float]], None]
 def _going_on(data: TrainingData, before: Predictor) -> TrainingData:
     """The data at the scales of weights, with the texels of the garments that these have seen."""
     points, old = data.texel_points, before.texel_points.valid
-    valid = {t: seen | old[t] if t in old else seen for t, seen in points.valid.items()}
+    valid = old | {t: seen | old[t] if t in old else seen for t, seen in points.valid.items()}
     points = dataclasses.replace(points, valid=valid)
     return dataclasses.replace(data, normalisation=before.normalisation, texel_points=points)
 
@@ -255,8 +255,8 @@ def _validate(
 ) -> tuple[dict[str, float], dict[str, tuple[np.ndarray, np.ndarray]]]:
     """Mean absolute errors [mm] on held-out frames, and maps of a frame in the middle."""
     config = problem.config
-    sums = dict.fromkeys(config.model.templates, 0.0)
-    weights = dict.fromkeys(config.model.templates, 0.0)
+    sums = dict.fromkeys(config.templates, 0.0)
+    weights = dict.fromkeys(config.templates, 0.0)
     shown: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     held = list(_held_batches(frames, config.batch))
     for n, batch in enumerate(held):

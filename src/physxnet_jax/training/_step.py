@@ -43,7 +43,7 @@ def _prepare(problem: Problem, batch: Batch) -> tuple[Array, dict[str, Array], d
     )
     x = problem.motion_atlas.to_map(normalise(features[:, 0], problem.normalisation, inputs))
     targets, masks = {}, {}
-    for t in config.model.templates:
+    for t in config.templates:
         table = problem.tables[t]
         # Where every sample has a garment of its own, vertices alone are compared.
         if isinstance(table, GarmentTables):
@@ -74,7 +74,7 @@ def _loss_inputs(
         garment = batch[f"garment_{t}"]
         vertices, present, edges = table.sample(seen, garment), table.present[garment], None
         scaled = stored / scale
-        place = problem.config.model.templates.index(t)
+        place = problem.config.templates.index(t)
         elastic = table.elastic_energy(
             scale * vertices,
             garment,
@@ -112,8 +112,11 @@ def _maps_of_garments(
     problem: Problem, network: Any, x: Array, batch: Batch, dtype: Any
 ) -> dict[str, Array]:
     """Maps of every template for its own samples, which all went through the encoder."""
-    templates, out = problem.config.model.templates, {}
-    parts = [jnp.split(f, len(templates)) for f in network.encode(x)]
+    config, out = problem.config, {}
+    templates, features = config.templates, network.encode(x)
+    if config.learned:
+        features = jax.lax.stop_gradient(features)
+    parts = [jnp.split(f, len(templates)) for f in features]
     for k, t in enumerate(templates):
         conditions = problem.tables[t].conditions[batch[f"garment_{t}"]]  # pyright: ignore
         known = network.modulation(t, conditions.astype(dtype))
@@ -130,7 +133,7 @@ def _mean_error(x: LossInputs) -> Float[Array, ""]:
 
 def _stack(problem: Problem, maps: dict[str, Array], masks: dict[str, Array]) -> Array:
     """All templates' maps as one, where they count: the discriminator's input."""
-    return jnp.concatenate([maps[t] * masks[t] for t in problem.config.model.templates], axis=-1)
+    return jnp.concatenate([maps[t] * masks[t] for t in problem.config.templates], axis=-1)
 
 
 @jax.jit
@@ -151,7 +154,7 @@ def eval_step(
     x, targets, masks = _prepare(problem, batch)
     maps, _ = _apply_generator(problem, state.generator, state, x, batch, train=False)
     losses, shown = {}, {}
-    for t in config.model.templates:
+    for t in config.templates:
         scale = problem.normalisation.offset[t]
         found = _loss_inputs(problem, t, maps[t], targets, batch)
         losses[t] = 1e3 * scale * _mean_error(found)
@@ -181,7 +184,7 @@ def train_step(
         PhysXNet, equations 1 and 2.
     """
     config = problem.config
-    templates, dtype = config.model.templates, jnp.dtype(config.precision)
+    templates, dtype = config.templates, jnp.dtype(config.precision)
     x, targets, masks = _prepare(problem, batch)
 
     def generator_loss(params: Any) -> tuple[Array, tuple]:
@@ -309,7 +312,13 @@ def _apply_generator(
         return _maps_of_garments(problem, network, maps, batch, dtype)
 
     return _apply_network(
-        problem.generator, params, state.generator_rest, x, dtype=dtype, train=train, call=call
+        problem.generator,
+        params,
+        state.generator_rest,
+        x,
+        dtype=dtype,
+        train=train and not config.learned,
+        call=call,
     )
 
 
