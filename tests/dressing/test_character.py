@@ -266,6 +266,7 @@ def test_skin_registered_to_another_limb_is_ignored(man, monkeypatch):
     np.testing.assert_allclose(other.residual[:, rows], found.residual[:, rows], atol=2e-3)
 
 
+@pytest.mark.release
 def test_coarse_mesh_corners_above_the_skin_are_measured(character):
     skin = character.surface[:1]
     normals = smooth_normals(skin, np.asarray(character.body.rest_mesh().faces))
@@ -278,6 +279,7 @@ def test_coarse_mesh_corners_above_the_skin_are_measured(character):
     assert _corners(character.body, skin[:, rows] - 0.006 * normals[:, rows], skin).max() == 0.0
 
 
+@pytest.mark.release
 def test_body_and_shape_are_refused_with_a_character(body, character):
     with pytest.raises(PhysXNetError, match="leave out body and shape"):
         dress(character, ["top"], shape=body.default_shape())

@@ -54,6 +54,7 @@ def test_stream_matches_the_clip(dresser, whole, motion):
         )
 
 
+@pytest.mark.release
 def test_vmap_batches_over_people(dresser, whole, motion):
     rotations, root = motion
     crowd = jnp.stack([root, root + jnp.array([[1.0, 0.0, 2.0]])])
@@ -196,6 +197,7 @@ def test_garments_without_a_decoder_are_refused():
         make_dresser(["cape"])
 
 
+@pytest.mark.release
 def test_garment_sizes_share_one_compiled_program(dresser, motion):
     """Sizes of one pattern share a compiled program, whatever is told of their files."""
     base = dresser.garments[0]

@@ -110,6 +110,7 @@ def test_dressed_cloth_is_unchanged_by_fitting(tmp_path, trousers):
     np.testing.assert_allclose(worn.garments[0].positions, same.garments[0].positions, atol=2e-4)
 
 
+@pytest.mark.release
 def test_distance_to_each_template_is_reported(tmp_path, trousers, capsys):
     path = saved(tmp_path, "a.obj", *trousers)
     found = inspect_garment(path)

@@ -106,6 +106,7 @@ def test_blocks_are_delivered_as_they_are_finished(motion):
     np.testing.assert_array_equal(whole, clip.garments[0].positions)
 
 
+@pytest.mark.release
 def test_clip_matches_clothe(motion):
     dresser = make_dresser(["bottom"], inference=PLAIN)
     posed = pose_clip(dresser.body, dresser.rest, motion)

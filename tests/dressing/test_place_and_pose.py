@@ -31,7 +31,7 @@ def motion():
     return load_motion("walk", fps=30.0)[:FRAMES]
 
 
-@pytest.fixture(scope="module", params=["lbs", "network"])
+@pytest.fixture(scope="module", params=["lbs", pytest.param("network", marks=pytest.mark.release)])
 def dresser(request):
     return make_dresser(["bottom"], method=request.param, inference=NANO)
 

@@ -50,6 +50,7 @@ def test_edge_strain_of_a_scaled_garment_is_exact():
     np.testing.assert_allclose(strain[1], 0.1, rtol=1e-9)
 
 
+@pytest.mark.release
 def test_penetration_is_measured_at_selected_frames(standing):
     assembly = prepare_scene(Scene((template("bottom"),), (Gravity(),))).assembly
     motion = Motion(

@@ -116,6 +116,7 @@ def test_the_low_side_of_a_neckline_is_the_front(kind, wardrobe):
     assert any("turned by 180" in n for n in back.notes)
 
 
+@pytest.mark.release
 def test_shorts_aligned_with_trousers_stay_short(wardrobe):
     garment = wardrobe["shorts"]
     x = 100 * (np.asarray(garment.mesh.vertices, float) + [0.0, 0.4, 0.1])

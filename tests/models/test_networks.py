@@ -220,6 +220,7 @@ def test_stride_selects_whole_frames_of_the_history(worn, body, rest):
     assert np.abs(np.asarray(old)[6:, :, :3] - np.asarray(new)[6:, :, :3]).max() > 0.1
 
 
+@pytest.mark.release
 def test_position_channel_encodes_the_pose_at_rest(worn, body, rest):
     """A raised arm that is held still: velocities are silent, its place is not."""
     _, surface, _ = worn

@@ -65,7 +65,7 @@ def person_shape(words: tuple[str, ...]) -> Float[Array, " shapes"]:
 def _garments(outfit: Outfit) -> dict[str, Garment]:
     out: dict[str, Garment] = {}
     # Cached arrays mustn't be tracers of an enclosing transformation.
-    with jax.ensure_compile_time_eval():
+    with jax.core.eval_context():
         params = outfit.params()
         for word in outfit.wear:
             item = parse_wear(word)
