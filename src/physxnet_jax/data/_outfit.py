@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from typing import Any
 
-import jax
+from jax.core import eval_context
 from jaxtyping import Array, Float
 
 from ..body import load_body
@@ -65,7 +65,7 @@ def person_shape(words: tuple[str, ...]) -> Float[Array, " shapes"]:
 def _garments(outfit: Outfit) -> dict[str, Garment]:
     out: dict[str, Garment] = {}
     # Cached arrays mustn't be tracers of an enclosing transformation.
-    with jax.core.eval_context():
+    with eval_context():
         params = outfit.params()
         for word in outfit.wear:
             item = parse_wear(word)

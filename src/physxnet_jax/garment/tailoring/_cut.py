@@ -6,7 +6,7 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import Tracer, eval_context
 from jaxtyping import Array, Float
 
 from ...body import Body, load_body
@@ -128,7 +128,7 @@ def _usual_arm() -> float:
 def measure_usual_arm() -> float:
     """Length of the default shape's arms along the middles of their rings [m]."""
     body = load_body()
-    with jax.core.eval_context():
+    with eval_context():
         surface = _carrier_of(body.rest_vertices(body.default_shape()))
         return float(jax.jit(lambda s: _arm_length(_bare(s)))(surface))
 
@@ -186,7 +186,7 @@ def pattern_of(name: str, ends: tuple[tuple[str, float, float], ...]) -> Pattern
 def draw_class(name: str, ends: tuple[tuple[str, float, float], ...]) -> Pattern:
     """Draws the pattern of a kind and class on the default shape, in about ten seconds."""
     kind, charts, body = kind_of(name), load_charts(), load_body()
-    with jax.core.eval_context():
+    with eval_context():
         rest = body.rest_vertices(body.default_shape())
         surface = _carrier_of(rest)
         measures = resolve_measures(name, {})
@@ -356,7 +356,7 @@ def cut_vertices(
     fixed = chosen
     if like is not None:
         # Constants that are made under `jit` would be traced.
-        with jax.core.eval_context():
+        with eval_context():
             fixed = resolve_measures(kind, like)
     style = kind_of(kind)
     pattern = pattern_of(kind, class_of(style, fixed))
