@@ -220,11 +220,18 @@ def test_decoders_that_are_not_learned_stay(learned, tmp_path):
         model=model,
         start=str(tmp_path / "w"),
         learned=("top",),
-        epochs=1,
+        epochs=0.3,
         elastic_weight=1e-4,
     )
     assert config.templates == ("top",)
-    after = train(config, [sequence(TIGHT, 0.0), sequence(LOOSE, -OFF)], tmp_path / "run")
+    steps = []
+    after = train(
+        config,
+        [sequence(TIGHT, 0.0), sequence(LOOSE, -OFF)],
+        tmp_path / "run",
+        report=lambda _, total, __: steps.append(total),
+    )
+    assert steps == [2], "0.3 of the six steps of an epoch"
     was, now = (
         dict(nnx.to_flat_state(p.state)) for p in (load_predictor(str(tmp_path / "w")), after)
     )

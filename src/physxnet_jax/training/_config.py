@@ -13,7 +13,7 @@ class TrainConfig:
 
     Attributes:
         model: The network.
-        epochs: Passes over the training frames.
+        epochs: Passes over the training frames; also a part of one.
         batch: Frames per step; of each template with ``model.conditions``, where every sample has
             a garment of its own.
         learning_rate: Adam's learning rate for the generator.
@@ -64,7 +64,7 @@ class TrainConfig:
     """
 
     model: ModelConfig = dataclasses.field(default_factory=ModelConfig)
-    epochs: int = 150
+    epochs: int | float = 150
     batch: int = 8
     learning_rate: float = 2e-4
     discriminator_rate: float = 2e-4
@@ -94,9 +94,9 @@ class TrainConfig:
     max_skipped: int = 20
 
     def __post_init__(self) -> None:
-        check_counts(self, "epochs", "batch", "discriminator_width", "validate_every")
+        check_counts(self, "batch", "discriminator_width", "validate_every")
         check_counts(self, "patience", "checkpoint_every", "frames_in_memory", "max_skipped")
-        check_numbers(self, "learning_rate", "discriminator_rate", "muon_learning_rate")
+        check_numbers(self, "epochs", "learning_rate", "discriminator_rate", "muon_learning_rate")
         check_numbers(self, "l1_weight", "elastic_weight", zero=True)
         if not 0.0 <= self.b1 < 1.0:
             raise ValueError(f"b1 is {self.b1}; it must be at least 0 and below 1.")

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import math
 import pathlib
 import time
 from collections.abc import Callable, Iterator, Sequence as Items
@@ -98,7 +99,7 @@ def train(
         data = _going_on(data, before)
         network = nnx.merge(before.graph, before.state)
         identity += f" from {read_card(config.start)['sha256']}"
-    total = data.frames.steps_per_epoch * config.epochs
+    total = math.ceil(data.frames.steps_per_epoch * config.epochs)
     problem, first = make_problem(
         config,
         data.atlas,
