@@ -13,6 +13,7 @@ physxnet dataset build experiments/datasets.toml#default_left_out --out runs/clo
 physxnet dataset build experiments/datasets.toml#variants --out runs/clothes/variants
 physxnet train experiments/training.toml#base --name base --data runs/clothes/default --data runs/clothes/default_extra --data runs/clothes/default_mixed --data runs/clothes/default_left_out --data runs/clothes/variants --splits train extra --out runs/base
 physxnet train experiments/training.toml#finish-base --name base --data runs/clothes/default --data runs/clothes/default_extra --data runs/clothes/default_mixed --data runs/clothes/default_left_out --data runs/clothes/variants --splits train extra --out runs/finish-base
+bash experiments/still.sh
 physxnet train experiments/training.toml#paper --name paper --data runs/ours --out runs/paper
 physxnet train experiments/training.toml#paper --name paper-blender --data runs/blender --out runs/paper-blender
 physxnet train experiments/training.toml#local-22 --name local-22 --data runs/ours --out runs/local-22
