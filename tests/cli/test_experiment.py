@@ -164,7 +164,7 @@ def test_invalid_configurations_are_refused(tmp_path, capsys):
     wrong = (
         ("x = 1", "unknown key 'x'"),
         ("1 / 0", "not TOML"),
-        ("epochs = 1.5", "expected int"),
+        ("batch = 1.5", "expected int"),
         ("schedule = 'steep'", "expected constant, cosine"),
         ("model = { width = 'wide' }", "width is 'wide'"),
     )
