@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
 # Decoders of trousers and dresses that learned on, also on people who stand almost still: their
-# datasets, the packaged `small` and `base`, and the table of docs/networks.md. About six hours on two cores.
+# datasets, the packaged `small` and `base`, and the table of docs/networks.md. About three hours on two cores.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 sets=(dress dress_mixed dress_left_out dresses dress_still dresses_still bottom bottoms bottom_still bottoms_still)
