@@ -1,7 +1,7 @@
 """Networks on people who stand almost still, whom no captured motion shows.
 
 Command: python experiments/standing.py [--weights nano small base]
-Cost:    about twenty minutes on two cores; goes on where it was stopped.
+Cost:    about ten minutes on one core; goes on where it was stopped.
 Result:  experiments/results/standing.json and .md: for the first second of built-in clips and a
          person who stands at rest, the default dress and trousers by skinning, by each network,
          and guided: RMSE [mm] against the simulation at `standard`, and by how much higher the hem
