@@ -9,7 +9,6 @@ from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.core
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
@@ -108,7 +107,7 @@ def repeated(mesh: Mesh, tree: Any) -> Any:
 
 def at_home(tree: Any) -> Any:
     """Arrays of a pytree that are whole on every device, on this process's first device."""
-    return jax.tree.map(jnp.asarray, jax.device_get(tree))
+    return jax.device_put(jax.device_get(tree))
 
 
 def own_rows(count: int) -> slice:
@@ -187,4 +186,4 @@ def _copied(x: Any) -> Any:
     """An array on the default device."""
     if isinstance(x, jax.core.Tracer) or not isinstance(x, jax.Array):
         return x
-    return jnp.asarray(np.asarray(x))
+    return jax.device_put(np.asarray(x))

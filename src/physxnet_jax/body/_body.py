@@ -250,7 +250,7 @@ def _from_arrays(data: dict[str, np.ndarray]) -> Body:
     quantum = float(data["quantum"])
 
     def metres(x: np.ndarray) -> Array:
-        return jnp.asarray((x * quantum).astype(np.float32))
+        return jax.device_put((x * quantum).astype(np.float32))
 
     top = data["weights"].astype(np.float64)
     top /= top.sum(axis=1, keepdims=True)
@@ -258,15 +258,15 @@ def _from_arrays(data: dict[str, np.ndarray]) -> Body:
     np.add.at(weights, (np.arange(len(top))[:, None], data["weight_joints"]), top)
 
     def index(name: str) -> Array:
-        return jnp.asarray(data[name].astype(np.int32))
+        return jax.device_put(data[name].astype(np.int32))
 
     return Body(
         bases=metres(data["bases"]),
         deltas=metres(data["deltas"]),
         joint_rows=index("joint_rows"),
-        weights=jnp.asarray(weights.astype(np.float32)),
+        weights=jax.device_put(weights.astype(np.float32)),
         quads=index("body_quads"),
-        uv=jnp.asarray(data["uv"]),
+        uv=jax.device_put(data["uv"]),
         uv_quads=index("body_uv_quads"),
         tights_quads=index("tights_quads"),
         skirt_quads=index("skirt_quads"),

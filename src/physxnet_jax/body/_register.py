@@ -201,7 +201,7 @@ class _Fit:
             slide = _SLIDE if last and k > steps // 2 else 0.0
             hessian, slope = _normal_equations(
                 self.body,
-                jnp.asarray(rows),
+                jax.device_put(rows),
                 jnp.asarray(points, jnp.float32),
                 jnp.asarray(normals, jnp.float32),
                 jnp.asarray(np.sqrt(weight), jnp.float32),
@@ -332,7 +332,7 @@ def _project_to_surface(
     sure = distance < _CLOSE
     posed = np.einsum("vk,vkc->vc", bary, target.vertices[target.faces[face]])
     # Vertices without a match keep their smoothed positions and follow a nearby face.
-    blend = np.asarray(blend_rotations(weights, jnp.asarray(world)), np.float64)
+    blend = np.asarray(blend_rotations(weights, jax.device_put(world)), np.float64)
     moved = np.asarray(weights, np.float64) @ shift
     flat = np.linalg.solve(blend, (x - moved)[:, :, None])[:, :, 0]
     return Registration(

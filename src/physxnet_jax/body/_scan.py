@@ -1,5 +1,6 @@
 """A person's surface, sampled as points with normals."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial import KDTree
@@ -63,7 +64,7 @@ class Scan:
         fallback = np.take_along_axis(face, first[:, None], axis=1)
         face = np.where(facing, face, fallback).astype(np.int32)
         mesh = make_mesh(self.vertices.astype(np.float32), self.faces)
-        found = closest_among(mesh, jnp.asarray(points, jnp.float32), jnp.asarray(face))
+        found = closest_among(mesh, jnp.asarray(points, jnp.float32), jax.device_put(face))
         distance = np.sqrt(np.asarray(found.squared_distance))
         distance = np.where(facing.any(axis=1), distance, np.inf)
         return np.asarray(found.face), np.asarray(found.weights), distance

@@ -11,7 +11,6 @@ from collections.abc import Collection
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..body import Body
@@ -394,9 +393,9 @@ def skinned_cloth(scene: PreparedScene, motion: Motion) -> np.ndarray:
     a = scene.assembly
     moved = animate(
         a.body,
-        jnp.asarray(a.rest_body.astype(np.float32)),
-        jnp.asarray(a.rest.astype(np.float32)),
-        jnp.asarray(a.weights.astype(np.float32)),
+        jax.device_put(a.rest_body.astype(np.float32)),
+        jax.device_put(a.rest.astype(np.float32)),
+        jax.device_put(a.weights.astype(np.float32)),
         motion,
     )
     return np.asarray(moved)

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -56,5 +56,5 @@ def _mirror_images(
     """The mirror image of each vertex on a garment: triangle corners and weights."""
     vertices = np.frombuffer(vertices_bytes, np.float32).reshape(-1, 3)
     faces = np.frombuffer(faces_bytes, np.int32).reshape(-1, 3)
-    closest = closest_points(make_mesh(vertices, faces), jnp.asarray(vertices * _FLIP))
+    closest = closest_points(make_mesh(vertices, faces), jax.device_put(vertices * _FLIP))
     return faces[np.asarray(closest.face)], np.asarray(closest.weights)

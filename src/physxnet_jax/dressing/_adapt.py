@@ -290,7 +290,7 @@ def _learn(
         for c in drawn:
             start = rng.integers(room[c])
             taken.append(clips[c].take(slice(start, start + config.frames)))
-        frames = jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)), *taken)
+        frames = jax.tree.map(lambda *x: jax.device_put(np.concatenate(x)), *taken)
         params, memory = _step(task, now.params, now.memory, frames, optimizer)
         now = dataclasses.replace(now, params=params, memory=memory, step=jnp.int32(step))
         if step % config.validate_every == 0 or step == config.steps:

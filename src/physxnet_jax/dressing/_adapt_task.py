@@ -163,8 +163,8 @@ def make_task(
         conditions=conditions,
         system=system,
         collider=collider,
-        index=jnp.asarray(index),
-        share=jnp.asarray(share / share.sum(axis=1, keepdims=True)),
+        index=jax.device_put(index),
+        share=jax.device_put(share / share.sum(axis=1, keepdims=True)),
         mass=jnp.where(inverse > 0, 1.0 / jnp.where(inverse > 0, inverse, 1.0), 0.0),
         config=config,
         simulated=simulated,
@@ -291,7 +291,7 @@ def encode(
     r, t = (np.concatenate(pair) for pair in zip(before, (r, t), strict=True))
     count, parts = clip.num_frames, []
     for start in range(0, count, BLOCK):
-        padded = (jnp.asarray(padded_block(x, start + history, history)) for x in (r, t))
+        padded = (jax.device_put(padded_block(x, start + history, history)) for x in (r, t))
         made = _encode_block(task, params, *padded)
         parts.append(jax.tree.map(np.asarray, made))
     return jax.tree.map(lambda *x: np.concatenate(x)[:count], *parts)

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -108,7 +107,7 @@ def infer_clip(
     if dresser.guided is not None:
         # Here rather than in `infer`, so that all blocks are one program.
         state = init_guided(
-            dresser.guided, jnp.asarray(r[history - 1]), jnp.asarray(t[history - 1])
+            dresser.guided, jax.device_put(r[history - 1]), jax.device_put(t[history - 1])
         )
     store, done = None, 0
     if resume is not None:
@@ -119,7 +118,7 @@ def infer_clip(
             done += 1
     for start in range(BLOCK * done, clip.num_frames, BLOCK):
         start_time = time.perf_counter()
-        padded = (jnp.asarray(padded_block(x, start + history, history)) for x in (r, t))
+        padded = (jax.device_put(padded_block(x, start + history, history)) for x in (r, t))
         *out, state = infer_block(dresser, *padded, clip.motion.fps, state)
         count = min(BLOCK, clip.num_frames - start)
         raw, cloth = (
@@ -176,7 +175,7 @@ def resolve_clip_layers(
     frames = len(next(iter(positions.values())))
     blocks = []
     for at in range(0, frames, BLOCK):
-        cloth = tuple(jnp.asarray(padded_block(x, at, 0)) for x in positions.values())
+        cloth = tuple(jax.device_put(padded_block(x, at, 0)) for x in positions.values())
         blocks.append([np.asarray(x) for x in _resolve_block(tuple(layers), cloth)])
     return {n: np.concatenate([b[k] for b in blocks])[:frames] for k, n in enumerate(positions)}
 

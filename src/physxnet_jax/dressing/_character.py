@@ -5,7 +5,6 @@ import pathlib
 from collections.abc import Callable, Mapping, Sequence
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
@@ -208,7 +207,7 @@ def make_character(
         assert error is not None
         raise error
     surface = found.carried(positions, mesh.faces)
-    body = base.with_rest(jnp.asarray(found.rest))
+    body = base.with_rest(jax.device_put(found.rest))
     clothed = clothed_vertices(base)
     sure = found.sure & clothed
     for _ in range(2):
@@ -334,7 +333,7 @@ def bind_to_character(garment: Garment, character: Character) -> Garment:
     # The inner side of a thick garment faces the skin.
     outwards = smooth_normals(made[None], faces)[0] * np.asarray(garment.offset)
     free = outwards.sum(axis=1) > 0.0
-    taut = jnp.asarray(bridge_hollows(np.asarray(carried), made, faces, free))
+    taut = jax.device_put(bridge_hollows(np.asarray(carried), made, faces, free))
     mesh = dataclasses.replace(garment.mesh, vertices=taut)
     return dataclasses.replace(garment, mesh=mesh, offset=garment.offset + (taut - carried))
 
@@ -428,17 +427,17 @@ def resolve_character_collisions(
         np.asarray(faces_at_rest(collider))
     ].max(axis=1)
     most = np.maximum(np.asarray(collider.most), least)
-    collider = dataclasses.replace(collider, least=jnp.asarray(least), most=jnp.asarray(most))
+    collider = dataclasses.replace(collider, least=jax.device_put(least), most=jax.device_put(most))
     blocks = []
     for at in range(0, frames, BLOCK):
         x, r, t, offset = (padded_block(v, at, 0) for v in (positions, world, shift, residual))
         skin = np.asarray(
-            _skin_block(collider, jnp.asarray(r), jnp.asarray(t), jnp.asarray(offset))
+            _skin_block(collider, jax.device_put(r), jax.device_put(t), jax.device_put(offset))
         )
         near = np.stack(
             [_near(collider, rest_points, s, p[lying]) for s, p in zip(skin, x, strict=True)]
         )
-        out = _resolve_block(collider, *(jnp.asarray(v) for v in (x, r, skin, near)))
+        out = _resolve_block(collider, *(jax.device_put(v) for v in (x, r, skin, near)))
         blocks.append(np.asarray(out))
     return np.concatenate(blocks)[:frames]
 

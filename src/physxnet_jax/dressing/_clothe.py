@@ -214,7 +214,7 @@ def pad_frames(
         return rotations, root
     # On the host: another length would be another program here too.
     index = np.minimum(np.arange(length), frames - 1)
-    q, p = (jnp.asarray(np.asarray(x)[index]) for x in (rotations, root))
+    q, p = (jax.device_put(np.asarray(x)[index]) for x in (rotations, root))
     return q, p
 
 

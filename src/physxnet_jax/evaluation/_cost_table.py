@@ -31,9 +31,8 @@ _FRAMES = 64
 _SECONDS = 0.5
 # Times with another value of this marker were measured differently and are discarded.
 _TIMING_VERSION = "tailored garments together, each profile as a whole"
-# A profile is timed for a budget if it is expected to take at most so many times as long: where one
-# of its kind has been timed here, and where none has.
-_DOUBT, _DOUBT_OF_KIND = 1.5, 4.0
+# A profile is timed for a budget if it is expected to take at most so many times as long.
+_DOUBT = 1.5
 ALONE_AND_TOGETHER: tuple[tuple[Template, ...], ...] = (*((t,) for t in TEMPLATES), TEMPLATES)
 """Each template alone, and all of them together."""
 
@@ -227,9 +226,11 @@ def choose_method(
     """`select_method`, timing on this machine only the profiles that matter.
 
     Profiles without a time here are expected to take their `MethodProfile.usual_ms`, times the
-    ratio that those of their kind have shown. With a budget the most accurate profile that may fit
-    is timed, until one fits: on a CPU those that are expected to take up to four times as long,
-    elsewhere all. With an error the one that is expected to be fastest is timed, until it is.
+    ratio that those of their kind have shown, on a CPU that of other kinds where none of their own
+    has been timed. With a budget the most accurate profile that may fit is timed, until one fits:
+    those that are expected to take up to 1.5 times as long; on another device than a CPU, of which
+    nothing is usual, any of a kind that hasn't been timed. With an error the one that is expected
+    to be fastest is timed, until it is.
 
     Args:
         templates: Template of each garment to wear.
@@ -248,7 +249,7 @@ def choose_method(
     key = worn_key(templates)
     able = [r for r in profiles if all(t in r.rmse_mm for t in templates)]
     # What is usual is so on a CPU.
-    doubt = _DOUBT_OF_KIND if jax.default_backend() == "cpu" else math.inf
+    usual_here = jax.default_backend() == "cpu"
 
     def known() -> dict[str, float]:
         """Times of the profiles that have one here."""
@@ -261,9 +262,11 @@ def choose_method(
         here, kinds = known(), {r.name: r.kind for r in able}
         out = {}
         for name, ms in usual.items():
-            ratios = [here[n] / usual[n] for n in here if kinds[n] == kinds[name]]
-            times = ms * statistics.median(ratios or [1.0])
-            out[name] = (times, _DOUBT if ratios else doubt)
+            ratio = {n: here[n] / usual[n] for n in here}
+            own = [x for n, x in ratio.items() if kinds[n] == kinds[name]]
+            ratios = own or (list(ratio.values()) if usual_here else [])
+            first = 1.0 if usual_here else math.inf
+            out[name] = (ms * statistics.median(ratios or [1.0]), _DOUBT if ratios else first)
         return out | {name: (ms, 1.0) for name, ms in here.items()}
 
     while able:

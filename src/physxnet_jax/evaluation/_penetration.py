@@ -345,10 +345,10 @@ def _height(
     index = np.pad(faces[patch], ((0, rows - len(points)), (0, 0), (0, 0)))
     p = np.pad(np.asarray(points, np.float32), ((0, rows - len(points)), (0, 0)))
     height, weights, best = _signed(
-        jnp.asarray(p),
-        jnp.asarray(np.asarray(mesh, np.float32)),
-        jnp.asarray(np.asarray(normals, np.float32)),
-        jnp.asarray(index),
+        jax.device_put(p),
+        jax.device_put(np.asarray(mesh, np.float32)),
+        jax.device_put(np.asarray(normals, np.float32)),
+        jax.device_put(index),
     )
     n = len(points)
     best = np.asarray(best)[:n]

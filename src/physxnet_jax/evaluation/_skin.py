@@ -1,5 +1,6 @@
 """The skin of a scene's person in chosen frames."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -15,7 +16,7 @@ def animated_skin(
     """Skin vertices in these frames of a motion [m]."""
     body, rest = assembly.body, jnp.asarray(assembly.rest_body, jnp.float32)
     part = Motion(
-        jnp.asarray(motion.rotations)[frames], jnp.asarray(motion.root)[frames], motion.fps
+        jax.device_put(motion.rotations)[frames], jax.device_put(motion.root)[frames], motion.fps
     )
-    weights = jnp.asarray(body.weights[:NUM_BODY_VERTICES])
+    weights = jax.device_put(body.weights[:NUM_BODY_VERTICES])
     return np.asarray(animate(body, rest, rest[:NUM_BODY_VERTICES], weights, part))

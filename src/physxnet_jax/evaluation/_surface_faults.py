@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -114,8 +115,8 @@ def _found_cover(
     faces, outer_faces = (
         np.frombuffer(b, np.int32).reshape(-1, 3) for b in (faces_bytes, outer_faces_bytes)
     )
-    x = jnp.asarray(inner)
-    normals = vertex_normals(x, jnp.asarray(faces))
+    x = jax.device_put(inner)
+    normals = vertex_normals(x, jax.device_put(faces))
     mesh = make_mesh(outer, outer_faces)
     over, open_ = np.zeros(len(x), bool), np.ones(len(x), bool)
     # From a little below: cloth may rest on the skin or in it.

@@ -1,5 +1,6 @@
 """Clearance between a garment and the skin at rest."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -39,7 +40,7 @@ def clearance(
     pick = np.minimum(np.arange(-(-count // _ROWS) * _ROWS), count - 1)
     near = nearby_faces(vertices, faces, np.asarray(points))
     p = jnp.asarray(np.asarray(points)[pick], jnp.float32)
-    hit = closest_among(body, p, jnp.asarray(near[pick]))
+    hit = closest_among(body, p, jax.device_put(near[pick]))
     distance = np.asarray(signed_distance(body, p, closest=hit))[:count]
     normals = vertex_normals(np.asarray(body.vertices), np.asarray(body.faces))
     tri = faces[np.asarray(hit.face)[:count]]

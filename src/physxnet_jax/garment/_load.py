@@ -332,7 +332,7 @@ def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
     skin = body.rest_mesh()
     rest = body.rest_vertices(body.default_shape())
     v, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    points = jnp.asarray(v.astype(np.float32))
+    points = jax.device_put(v.astype(np.float32))
     refs, shares, weights = nearest_skin(skin, body, v, faces)
     closest = jnp.einsum("vk,vkc->vc", shares, rest[refs], precision=jax.lax.Precision.HIGHEST)
     pinned = np.zeros(len(v), dtype=bool)
@@ -344,11 +344,11 @@ def carried(mesh: TriMesh, kind: Template, name: str, body: Body) -> Garment:
     pinned[np.setdiff1d(np.arange(len(v)), faces)] = True
     return Garment(
         mesh,
-        jnp.asarray(pinned),
+        jax.device_put(pinned),
         refs,
         shares,
         points - closest,
-        jnp.asarray(weights.astype(np.float32)),
+        jax.device_put(weights.astype(np.float32)),
         COTTON,
         kind,
         name,
@@ -372,7 +372,7 @@ def _band(
     far = float(np.linalg.norm(gap[upper], axis=1).mean())
     if v[upper, 1].max() >= _SHOULDERS or far >= _AROUND:
         return None
-    return jnp.asarray(np.column_stack([upper, np.roll(upper, -1)]).astype(np.int32))
+    return jax.device_put(np.column_stack([upper, np.roll(upper, -1)]).astype(np.int32))
 
 
 def guess_template(

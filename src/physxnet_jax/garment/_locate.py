@@ -5,7 +5,7 @@ import pathlib
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -249,12 +249,16 @@ def nearest_skin(
     """
     near = nearby_faces(np.asarray(skin.vertices), np.asarray(skin.faces), vertices, neighbours=12)
     points = padded_rows(vertices.astype(np.float32))
-    hit = closest_among(skin, jnp.asarray(points), jnp.asarray(padded_rows(near)))
+    hit = closest_among(skin, jax.device_put(points), jax.device_put(padded_rows(near)))
     refs = skin.faces[hit.face]
     skin_weights = carried_weights(body.weights, refs, hit.weights)
     known = (refs, hit.weights, skin_weights, hit.squared_distance)
     refs, shares, weights, squared = (np.asarray(x)[: len(vertices)] for x in known)
-    return jnp.asarray(refs), jnp.asarray(shares), _smooth_far(weights, faces, np.sqrt(squared))
+    return (
+        jax.device_put(refs),
+        jax.device_put(shares),
+        _smooth_far(weights, faces, np.sqrt(squared)),
+    )
 
 
 def _smooth_far(weights: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> np.ndarray:

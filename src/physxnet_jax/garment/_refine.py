@@ -2,7 +2,7 @@
 
 import dataclasses
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -44,11 +44,11 @@ def refine_garment(garment: Garment, longest: float) -> Garment:
     return dataclasses.replace(
         garment,
         mesh=mesh,
-        pinned=jnp.asarray(held.all(axis=1)),
-        refs=jnp.asarray(np.asarray(garment.refs)[corners].reshape(len(x), -1)),
-        ref_weights=jnp.asarray(ref_weights),
-        offset=jnp.asarray(offset),
-        skin=jnp.asarray(skin / skin.sum(axis=1, keepdims=True)),
+        pinned=jax.device_put(held.all(axis=1)),
+        refs=jax.device_put(np.asarray(garment.refs)[corners].reshape(len(x), -1)),
+        ref_weights=jax.device_put(ref_weights),
+        offset=jax.device_put(offset),
+        skin=jax.device_put(skin / skin.sum(axis=1, keepdims=True)),
         polygons=None,
         coarse_faces=garment.mesh.faces if own is None else own,
     )

@@ -1,5 +1,6 @@
 """Simple cloth meshes for experiments and tests."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -82,11 +83,11 @@ def free_garment(
     first = np.asarray(body.rest_vertices(body.default_shape()), np.float64)[0]
     return Garment(
         make_mesh(v, faces),
-        jnp.asarray(held),
+        jax.device_put(held),
         jnp.zeros((len(v), 1), jnp.int32),
         jnp.ones((len(v), 1), jnp.float32),
-        jnp.asarray((v - first).astype(np.float32)),
-        jnp.asarray(skin),
+        jax.device_put((v - first).astype(np.float32)),
+        jax.device_put(skin),
         fabric,
         "top",
         name,

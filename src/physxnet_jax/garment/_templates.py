@@ -149,14 +149,14 @@ def template(name: Template) -> Garment:
 def _from_arrays(name: Template, part: dict[str, np.ndarray]) -> Garment:
     fabric = Fabric(*(float(x) for x in part["fabric"]))
     mesh = make_mesh(part["vertices"], part["faces"], part["uv"], name=name)
-    refs = jnp.asarray(part["refs"].astype(np.int32))
-    weights = jnp.asarray(part["ref_weights"])
+    refs = jax.device_put(part["refs"].astype(np.int32))
+    weights = jax.device_put(part["ref_weights"])
     return Garment(
         mesh,
-        jnp.asarray(part["pinned"]),
+        jax.device_put(part["pinned"]),
         refs,
         weights,
-        jnp.asarray(part["offset"]),
+        jax.device_put(part["offset"]),
         carried_weights(load_body().weights, refs, weights),
         fabric,
         name,
@@ -204,11 +204,11 @@ def _assemble(
     mesh = make_mesh(vertices, piece.faces, _cylinder_uv(vertices), name=name)
     return Garment(
         mesh,
-        jnp.asarray(pinned),
-        jnp.asarray(index),
-        jnp.asarray(weight),
-        jnp.asarray(offset.astype(np.float32)),
-        carried_weights(body.weights, jnp.asarray(index), jnp.asarray(weight)),
+        jax.device_put(pinned),
+        jax.device_put(index),
+        jax.device_put(weight),
+        jax.device_put(offset.astype(np.float32)),
+        carried_weights(body.weights, jax.device_put(index), jax.device_put(weight)),
         fabric,
         name,
         name,

@@ -28,7 +28,11 @@ from ._laplacian import (
 from ._materialize import materialize as materialize
 from ._mesh import TriMesh as TriMesh, make_mesh as make_mesh
 from ._normals import vertex_normals as vertex_normals
-from ._padding import pad_rows as pad_rows, padded_rows as padded_rows
+from ._padding import (
+    ROW_MULTIPLE as ROW_MULTIPLE,
+    pad_rows as pad_rows,
+    padded_rows as padded_rows,
+)
 from ._patches import patch_shares as patch_shares
 from ._polygons import (
     Material as Material,

@@ -354,7 +354,7 @@ def signed_distance(
     """
     hit = closest_points(mesh, points) if closest is None else closest
     edges = mesh_edges(np.asarray(mesh.faces))
-    return _signed(mesh, points, hit, jnp.asarray(edges.faces), jnp.asarray(edges.of_face))
+    return _signed(mesh, points, hit, jax.device_put(edges.faces), jax.device_put(edges.of_face))
 
 
 @jax.jit

@@ -101,11 +101,11 @@ def make_edge_constraints(
         offsets = vertices[order[index[-1]]] - vertices[members]
         length.append(np.linalg.norm(offsets, axis=2).astype(np.float32))
     return EdgeConstraints(
-        jnp.asarray(order),
-        jnp.asarray(back),
-        tuple(map(jnp.asarray, index)),
-        tuple(map(jnp.asarray, weight)),
-        tuple(map(jnp.asarray, length)),
+        jax.device_put(order),
+        jax.device_put(back),
+        tuple(map(jax.device_put, index)),
+        tuple(map(jax.device_put, weight)),
+        tuple(map(jax.device_put, length)),
     )
 
 

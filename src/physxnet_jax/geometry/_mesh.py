@@ -2,7 +2,7 @@
 
 import dataclasses
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -80,7 +80,7 @@ def make_mesh(
         row = int(np.argwhere(~np.isfinite(v).all(axis=1))[0, 0])
         raise MeshError(f"{name}: vertex {row} is not finite ({v[row].tolist()}). Export it again.")
     if uv is None:
-        return TriMesh(jnp.asarray(v), jnp.asarray(f.astype(np.int32)))
+        return TriMesh(jax.device_put(v), jax.device_put(f.astype(np.int32)))
     t = np.asarray(uv, dtype=np.float32)
     tf = f if uv_faces is None else np.asarray(uv_faces, dtype=np.int64)
     if t.ndim != 2 or t.shape[1] != 2 or tf.shape != f.shape:
@@ -97,8 +97,8 @@ def make_mesh(
         row = int(np.argwhere(~np.isfinite(t).all(axis=1))[0, 0])
         raise MeshError(f"{name}: uv {row} is not finite ({t[row].tolist()}). Export it again.")
     return TriMesh(
-        jnp.asarray(v),
-        jnp.asarray(f.astype(np.int32)),
-        jnp.asarray(t),
-        jnp.asarray(tf.astype(np.int32)),
+        jax.device_put(v),
+        jax.device_put(f.astype(np.int32)),
+        jax.device_put(t),
+        jax.device_put(tf.astype(np.int32)),
     )

@@ -4,7 +4,8 @@ import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Float, Int, Shaped
 
-_MULTIPLE = 1024
+ROW_MULTIPLE = 1024
+"""`padded_rows` pads to multiples of it."""
 
 
 def padded_rows(values: Shaped[np.ndarray, "rows ..."]) -> Shaped[np.ndarray, "padded ..."]:
@@ -20,7 +21,7 @@ def padded_rows(values: Shaped[np.ndarray, "rows ..."]) -> Shaped[np.ndarray, "p
         >>> padded_rows(np.zeros((3, 2))).shape
         (1024, 2)
     """
-    more = -len(values) % _MULTIPLE
+    more = -len(values) % ROW_MULTIPLE
     return np.concatenate([values, np.repeat(values[-1:], more, axis=0)])
 
 

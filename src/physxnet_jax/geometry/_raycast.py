@@ -89,9 +89,9 @@ def cast_rays(
     ).astype(np.float32)
     return _cast(
         mesh.vertices,
-        jnp.asarray(faces),
-        jnp.asarray(edges.vertices),
-        jnp.asarray(edges.of_face),
+        jax.device_put(faces),
+        jax.device_put(edges.vertices),
+        jax.device_put(edges.of_face),
         jnp.asarray(sign, dtype=mesh.vertices.dtype),
         jnp.asarray(origins),
         jnp.asarray(directions),
@@ -167,10 +167,10 @@ def cast_rays_within(
                 store[ray] = value.reshape(-1, *value.shape[2:])
     valid = np.isfinite(out[2])
     return RayHits(
-        jnp.asarray(np.where(valid, out[0], 0).astype(np.int32)),
+        jax.device_put(np.where(valid, out[0], 0).astype(np.int32)),
         jnp.asarray(out[1], jnp.float32),
         jnp.asarray(out[2], jnp.float32),
-        jnp.asarray(valid),
+        jax.device_put(valid),
     )
 
 

@@ -84,7 +84,7 @@ def gaussian_stencil(
             index[row, : len(near)] = near
             weight[row, : len(near)] = np.exp(-0.5 * (d[near] / radius) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
-    return Stencil(jnp.asarray(index), jnp.asarray(weight.astype(np.float32)))
+    return Stencil(jax.device_put(index), jax.device_put(weight.astype(np.float32)))
 
 
 @pytree

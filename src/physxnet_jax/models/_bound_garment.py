@@ -74,7 +74,7 @@ def bind_garment(
     """
     base, radius = rest, _SMOOTHING
     if garment.template == "dress":
-        base = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
+        base = jax.device_put(dress_body(body, np.asarray(rest)).astype(np.float32))
         radius = _SMOOTHING_SKIRT
     mesh = garment.mesh
     smoothing = None

@@ -115,7 +115,7 @@ def make_texel_points(
         rest: Its rest vertices [m].
         valid: Texels that each template covers.
     """
-    joined = jnp.asarray(dress_body(body, np.asarray(rest)).astype(np.float32))
+    joined = jax.device_put(dress_body(body, np.asarray(rest)).astype(np.float32))
     return TexelPoints(
         atlas.at_texels(rest), atlas.at_texels(joined), atlas.at_texels(body.weights), valid
     )

@@ -248,10 +248,10 @@ def _filled(
         _check_finite(weights, parameter, x)
         leaves.append(x)
     state = jax.tree.unflatten(
-        structure, [jnp.asarray(x.astype(y.dtype)) for x, y in zip(leaves, like, strict=True)]
+        structure, [jax.device_put(x.astype(y.dtype)) for x, y in zip(leaves, like, strict=True)]
     )
     valid = {
-        t: jnp.asarray(np.unpackbits(tensors[f"valid_{t}"])[: atlas.num_texels].astype(bool))
+        t: jax.device_put(np.unpackbits(tensors[f"valid_{t}"])[: atlas.num_texels].astype(bool))
         for t in model.templates
     }
     n = card["normalisation"]

@@ -5,7 +5,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -137,8 +136,8 @@ def make_motion(rotations: Any, root: Any, fps: float | int, *, name: str = "mot
         part = r[at : at + _PART] / largest[at : at + _PART]
         out[at : at + _PART] = part / np.linalg.norm(part, axis=2, keepdims=True)
     return Motion(
-        jnp.asarray(out),
-        jnp.asarray(p.astype(np.float32)),
+        jax.device_put(out),
+        jax.device_put(p.astype(np.float32)),
         float(fps),
         name,
     )
@@ -196,7 +195,7 @@ def body_animation(
     body: Body, motion: Motion, shape: Float[Array, " shapes"] | None = None
 ) -> Float[Array, "frames vertices 3"]:
     """Body vertices [m] of every frame, computed in blocks to bound memory."""
-    return jnp.asarray(np.concatenate(list(body_blocks(body, motion, shape))))
+    return jax.device_put(np.concatenate(list(body_blocks(body, motion, shape))))
 
 
 def body_blocks(
@@ -228,7 +227,7 @@ def animate(
     Returns:
         Positions [m] of every frame.
     """
-    return jnp.asarray(
+    return jax.device_put(
         np.concatenate(list(animation_blocks(body, rest, vertices, weights, motion)))
     )
 

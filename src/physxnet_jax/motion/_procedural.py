@@ -7,7 +7,7 @@ forearms, +Z lifts the left arm sideways, +Y turns to the left.
 
 from collections.abc import Callable, Mapping
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Float
 from scipy.interpolate import CubicSpline
@@ -294,8 +294,8 @@ def _planted_root(
     """
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
     ankles = [body.joint("LeftFoot"), body.joint("RightFoot")]
-    heads = jnp.asarray(np.asarray(body.joint_positions(rest)[0])[ankles])
-    follow = jnp.asarray(np.eye(len(body.parents), dtype=np.float32)[ankles])
+    heads = jax.device_put(np.asarray(body.joint_positions(rest)[0])[ankles])
+    follow = jax.device_put(np.eye(len(body.parents), dtype=np.float32)[ankles])
     feet = np.asarray(animate(body, rest, heads, follow, motion), dtype=np.float64)
     left, right = feet[:, 0], feet[:, 1]
     # Soft choice of the standing foot: a hard switch would jerk the hips.

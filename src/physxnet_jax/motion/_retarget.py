@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.spatial.transform import Rotation
@@ -195,7 +195,7 @@ def stand_on_floor(body: Body, motion: Motion, rest: Float[Array, "all 3"]) -> M
     low, usual = float(heights.min()), float(np.quantile(heights, _ODD_FRAMES))
     low = usual if usual - low > THROUGH else low
     root = np.asarray(motion.root) - np.array([[0.0, low, 0.0]], np.float32)
-    return Motion(motion.rotations, jnp.asarray(root), motion.fps, motion.name)
+    return Motion(motion.rotations, jax.device_put(root), motion.fps, motion.name)
 
 
 def foot_heights(
@@ -203,7 +203,7 @@ def foot_heights(
 ) -> Float[np.ndarray, " frames"]:
     """Height of the lowest vertex of both feet in each frame [m]."""
     rows = np.flatnonzero(_foot_vertices(body))
-    feet, weights = (jnp.asarray(np.asarray(x)[rows]) for x in (rest, body.weights))
+    feet, weights = (jax.device_put(np.asarray(x)[rows]) for x in (rest, body.weights))
     blocks = animation_blocks(body, rest, feet, weights, motion)
     return np.concatenate([x[:, :, 1].min(axis=1) for x in blocks])
 

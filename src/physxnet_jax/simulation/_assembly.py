@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -143,7 +144,7 @@ def vertex_masses(
 
 def float32(x: np.ndarray) -> Array:
     """Converts to a float32 device array."""
-    return jnp.asarray(np.asarray(x, dtype=np.float32))
+    return jax.device_put(np.asarray(x, dtype=np.float32))
 
 
 # Cloth farther than this from the skin counts as loose [m].

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -99,6 +100,6 @@ def _stacked(tables: Sequence[ElasticTables]) -> ElasticTables:
         padded = [
             np.pad(r, [(0, most - len(r)), *[(0, 0)] * (r.ndim - 1)]) if r.ndim else r for r in rows
         ]
-        return jnp.asarray(np.stack(padded))
+        return jax.device_put(np.stack(padded))
 
     return ElasticTables(**{f.name: one(f.name) for f in dataclasses.fields(ElasticTables)})

@@ -256,6 +256,6 @@ def _pattern(scene: "PreparedScene") -> Pattern:
         at = order[np.searchsorted(key[order], p[:, 0] * count + p[:, 1])]
         return p[:, 0] * width + column[at]
 
-    slots = tuple(jnp.asarray(slot(p)) for p in pairs)
+    slots = tuple(jax.device_put(slot(p)) for p in pairs)
     nothing = jnp.zeros((count, width), jnp.float32)
-    return Pattern(jnp.asarray(neighbour), slots, nothing).rescaled(scene.effects)
+    return Pattern(jax.device_put(neighbour), slots, nothing).rescaled(scene.effects)

@@ -9,7 +9,6 @@ from collections.abc import Iterator, Mapping
 from typing import Any, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from .._version import __version__
@@ -73,7 +72,7 @@ class Resume:
             try:
                 data = read_arrays(path, limit=2 * path.stat().st_size + 1_000_000)
                 arrays = {k[6:]: x for k, x in data.items() if k.startswith("array_")}
-                found = [jnp.asarray(data[f"state_{i}"]) for i in range(len(leaves))]
+                found = [jax.device_put(data[f"state_{i}"]) for i in range(len(leaves))]
             except (ValueError, KeyError, OSError) as error:
                 raise SimulationError(
                     f"{path}: damaged ({type(error).__name__}). Delete it and the blocks after it;"

@@ -61,7 +61,7 @@ def warmup(body: Body, motion: Motion, *, seconds: float = 1.5, settle: float = 
         pair = Rotation.from_quat(np.stack([rest[j], first[j]]), scalar_first=True)
         rotations[:, j] = Slerp([0.0, 1.0], pair)(s).as_quat(scalar_first=True)
     root = np.repeat(np.asarray(motion.root[:1]), frames, axis=0)
-    return Motion(float32(rotations), jnp.asarray(root), motion.fps, f"{motion.name} warm-up")
+    return Motion(float32(rotations), jax.device_put(root), motion.fps, f"{motion.name} warm-up")
 
 
 Accuracy = Literal["draft", "standard", "fine", "reference"]
@@ -254,8 +254,8 @@ def _roll(
             mesh,
             system,
             state,
-            jnp.asarray(rotations[part]),
-            jnp.asarray(root[part]),
+            jax.device_put(rotations[part]),
+            jax.device_put(root[part]),
             solver=solver,
             fps=fps,
             time=jnp.asarray(start_time + at / fps, solver.precision),

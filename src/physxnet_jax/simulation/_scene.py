@@ -177,7 +177,7 @@ def prepare_scene(scene: Scene) -> PreparedScene:
         # Pinned vertices have infinite mass only if the scene has `Pin`.
         held = assembly.pinned if Pin in kinds else np.zeros_like(assembly.pinned)
         inverse = np.where(held, 0.0, 1.0 / assembly.mass)
-        inverse_mass = jnp.asarray(inverse.astype(np.float32))
+        inverse_mass = jax.device_put(inverse.astype(np.float32))
         acting = (e for e in scene.effects if not e.idle(assembly))
         prepared = tuple(e.prepare(assembly, inverse_mass) for e in acting)
     return PreparedScene(assembly, prepared, inverse_mass[:, None, None])
@@ -191,7 +191,7 @@ def make_system(scene: PreparedScene, solver: Solver) -> System:
         float32(scene.assembly.rest_body),
         scene.effects,
         scene.inverse_mass,
-        jnp.asarray(scene.assembly.faces.astype(np.int32)),
+        jax.device_put(scene.assembly.faces.astype(np.int32)),
         float32(scene.assembly.density),
         solver.prepare(scene),
     )

@@ -113,7 +113,7 @@ class System:
         held = self.inverse_mass[:, 0, 0] == 0.0
         inverse = jnp.where(held, 0.0, 1.0 / mass)
         faces = triangulate(self.body.quads)
-        normals = vertex_normals(rest[:NUM_BODY_VERTICES], jnp.asarray(faces))
+        normals = vertex_normals(rest[:NUM_BODY_VERTICES], jax.device_put(faces))
         new = Rest(cloth, rest, normals, inverse)
         return dataclasses.replace(
             self,

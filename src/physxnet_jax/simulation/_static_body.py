@@ -45,7 +45,7 @@ def settle_on_static_body(
         dtype = solver.precision
 
         def device(x: np.ndarray) -> Array:
-            return jnp.asarray(np.asarray(x, dtype))
+            return jax.device_put(np.asarray(x, dtype))
 
         x = assembly.rest if start is None else np.asarray(start, np.float64)
         v = np.zeros_like(x) if velocity is None else np.asarray(velocity, np.float64)

@@ -159,7 +159,7 @@ def prepare_garments(
         seen = np.zeros(atlas.num_texels, bool)
         for b in bound:
             seen[np.asarray(b.texel)[np.asarray(b.weight) > 0.0]] = True
-        valid[name] = jnp.asarray(seen)
+        valid[name] = jax.device_put(seen)
         count = wardrobe.num_vertices(name)
         maps = [
             condition_maps(atlas, body, rest, g, b, model.fabrics)
@@ -171,15 +171,15 @@ def prepare_garments(
         ]
         edges = [mesh_edges(np.asarray(g.mesh.faces)).vertices for g in garments]
         tables[name] = GarmentTables(
-            texel=jnp.asarray(np.stack([_padded(b.texel, count) for b in bound])),
-            weight=jnp.asarray(np.stack([_padded(b.weight, count) for b in bound])),
-            present=jnp.asarray(
+            texel=jax.device_put(np.stack([_padded(b.texel, count) for b in bound])),
+            weight=jax.device_put(np.stack([_padded(b.weight, count) for b in bound])),
+            present=jax.device_put(
                 np.stack([np.arange(count) < g.num_vertices for g in garments]).astype(np.float32)
             ),
             conditions=jnp.stack(maps),
-            patch=jnp.asarray(np.stack([_padded(i, count) for i, _ in shares])),
-            share=jnp.asarray(np.stack([_padded(w, count) for _, w in shares])),
-            edges=jnp.asarray(
+            patch=jax.device_put(np.stack([_padded(i, count) for i, _ in shares])),
+            share=jax.device_put(np.stack([_padded(w, count) for _, w in shares])),
+            edges=jax.device_put(
                 np.stack([_padded(e, max(map(len, edges))) for e in edges]).astype(np.int32)
             ),
             elastic=_elastic(wardrobe, name) if elastic else None,
@@ -199,7 +199,7 @@ def _elastic(wardrobe: Wardrobe, name: str) -> tuple[Array, Array, ElasticTables
     count = wardrobe.num_vertices(name)
     rests = [g.rest_vertices(body.rest_vertices(s)) for g, s in zip(garments, shapes, strict=True)]
     rest, skin = (
-        jnp.asarray(np.stack([_padded(x, count) for x in rows]))
+        jax.device_put(np.stack([_padded(x, count) for x in rows]))
         for rows in (rests, [g.skin for g in garments])
     )
     return rest, skin, elastic_tables(garments, shapes)

@@ -61,7 +61,7 @@ def prepare_targets(model: ModelConfig) -> tuple[Atlas, TexelPoints, dict[str, C
                 bind(g, atlas=atlas, body=body, rest=rest, valid=rows[t].valid),
                 smooth=not model.skirt_chart,
             ),
-            edges=jnp.asarray(mesh_edges(np.asarray(g.mesh.faces)).vertices),
+            edges=jax.device_put(mesh_edges(np.asarray(g.mesh.faces)).vertices),
         )
         for t, g in garments.items()
     }
@@ -179,11 +179,11 @@ def _sample_targets(
         )
     pick = rng.choice(good, min(32, len(good)), replace=False)
     meters = target_offsets(
-        jnp.asarray(frames.targets[name][pick]),
+        jax.device_put(frames.targets[name][pick]),
         table,
         texel_points,
-        jnp.asarray(frames.rotations[pick, -1]),
-        jnp.asarray(frames.translations[pick, -1]),
+        jax.device_put(frames.rotations[pick, -1]),
+        jax.device_put(frames.translations[pick, -1]),
         family,
     )
     return np.asarray(meters)[:, np.asarray(texel_points.valid[name])]

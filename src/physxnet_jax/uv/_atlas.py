@@ -170,8 +170,8 @@ def _make_atlas(size: tuple[int, int], body: Body, skirt: bool) -> Atlas:
     stretched = _stretch(uv, uv_faces)
     texels, own, bary = rasterise(stretched, uv_faces, height, width)
     transference = Transference(
-        jnp.asarray(faces[own].astype(np.int32)),
-        jnp.asarray(bary.astype(np.float32)),
+        jax.device_put(faces[own].astype(np.int32)),
+        jax.device_put(bary.astype(np.float32)),
         jnp.ones((len(own),), bool),
         NUM_BODY_VERTICES,
     )
@@ -180,11 +180,11 @@ def _make_atlas(size: tuple[int, int], body: Body, skirt: bool) -> Atlas:
         below = height * width + np.arange(skirt_chart.rows * width)
         texels = np.concatenate([texels, below]).astype(np.int32)
     return Atlas(
-        jnp.asarray(texels),
+        jax.device_put(texels),
         transference,
-        jnp.asarray(stretched.astype(np.float32)),
-        jnp.asarray(faces.astype(np.int32)),
-        jnp.asarray(uv_faces.astype(np.int32)),
+        jax.device_put(stretched.astype(np.float32)),
+        jax.device_put(faces.astype(np.int32)),
+        jax.device_put(uv_faces.astype(np.int32)),
         height + (0 if skirt_chart is None else skirt_chart.rows),
         width,
         before,

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -10,6 +11,7 @@ from scipy.spatial import KDTree
 from ..body import NUM_BODY_VERTICES, Body, load_body
 from ..garment import Garment, Template, template
 from ..geometry import (
+    ROW_MULTIPLE,
     TriMesh,
     cast_rays,
     cast_rays_within,
@@ -71,7 +73,7 @@ class Binding:
 def chart_mesh(atlas: Atlas, body: Body, rest: Float[Array, "all 3"], kind: Template) -> TriMesh:
     """The clothed part of the body at rest; with joined legs for a dress."""
     vertices = dress_body(body, np.asarray(rest)) if kind == "dress" else rest
-    full = jnp.asarray(np.asarray(vertices, dtype=np.float32))
+    full = jax.device_put(np.asarray(vertices, dtype=np.float32))
     return TriMesh(full[:NUM_BODY_VERTICES], atlas.faces, atlas.uv, atlas.uv_faces)
 
 
@@ -119,7 +121,7 @@ def garment_map_rows(
     hull = skirt_hull(body, np.asarray(rest))
     arms = arm_weights(body, np.asarray(atlas.to_body @ body.weights))
     upper = hull.share(np.asarray(points)[:, 1], arms) < 1.0
-    own = dataclasses.replace(own, valid=own.valid & jnp.asarray(upper))
+    own = dataclasses.replace(own, valid=own.valid & jax.device_put(upper))
     return _stacked(own, skirt_rows(atlas.skirt, hull, garment, _skirt_share(body, hull, garment)))
 
 
@@ -189,16 +191,16 @@ def bind(
         off = np.where(share == 1.0, missed, off)
     return Binding(
         Transference(
-            jnp.asarray(np.asarray(mesh.faces)[face]),
-            jnp.asarray(weights),
-            jnp.asarray(np.ones(face.shape, bool)),
+            jax.device_put(np.asarray(mesh.faces)[face]),
+            jax.device_put(weights),
+            jax.device_put(np.ones(face.shape, bool)),
             NUM_BODY_VERTICES,
         ),
-        jnp.asarray(texel),
-        jnp.asarray(weight),
-        jnp.asarray(np.float32(np.mean(good))),
-        jnp.asarray(np.int32(np.sum(~good))),
-        jnp.asarray(np.int32(off.sum())),
+        jax.device_put(texel),
+        jax.device_put(weight),
+        jax.device_put(np.float32(np.mean(good))),
+        jax.device_put(np.int32(np.sum(~good))),
+        jax.device_put(np.int32(off.sum())),
     )
 
 
@@ -230,9 +232,14 @@ def _hits(
     if len(points) > _MANY:
         hits = cast_rays_within(mesh, points, normals, reach)
     else:
-        padded = (jnp.asarray(padded_rows(x)) for x in (points, normals))
+        # A block at a time: one program for garments of all sizes.
+        padded = [padded_rows(x).reshape(-1, ROW_MULTIPLE, 3) for x in (points, normals)]
         most = _MAX_DISTANCE[garment.template]
-        hits = cast_rays(mesh, *padded, both=True, max_distance=most)
+        blocks = [
+            cast_rays(mesh, *jax.device_put(block), both=True, max_distance=most)
+            for block in zip(*padded, strict=True)
+        ]
+        hits = jax.tree.map(lambda *x: np.concatenate(x), *blocks)
     distance, ray_face, ray_weights = (
         np.asarray(x)[: len(points)] for x in (hits.distance, hits.face, hits.weights)
     )

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -94,7 +95,7 @@ def condition_maps(
     total = np.asarray(sampling.sum(axis=1)).ravel()
     seen = total > 1e-6
     means = np.where(seen[:, None], (sampling @ values) / np.maximum(total, 1e-6)[:, None], 0.0)
-    return _closed(atlas.to_map(jnp.asarray(means.astype(np.float32))))
+    return _closed(atlas.to_map(jax.device_put(means.astype(np.float32))))
 
 
 def _longest_edge(garment: Garment) -> float:
@@ -169,4 +170,4 @@ def _closed(maps: Float[Array, "height width channels"]) -> Float[Array, "height
     around = np.sum([padded[dy : dy + height, dx : dx + width] for dy, dx in places], axis=0)
     count = around[..., :1]
     hole = (m[..., :1] == 0.0) & (count >= 4.0)
-    return jnp.asarray(np.where(hole, around / np.maximum(count, 1.0), m))
+    return jax.device_put(np.where(hole, around / np.maximum(count, 1.0), m))

@@ -44,10 +44,10 @@ def rasterise(
     blocks = -(-len(faces) // chunk)
     pad = np.minimum(np.arange(blocks * chunk), len(faces) - 1)
     owner = _owners(
-        jnp.asarray(xy.astype(np.float32)),
-        jnp.asarray(np.asarray(faces, np.int32)[pad].reshape(blocks, chunk, 3)),
-        jnp.asarray(low[pad].reshape(blocks, chunk, 2)),
-        jnp.asarray(pad.astype(np.int32).reshape(blocks, chunk)),
+        jax.device_put(xy.astype(np.float32)),
+        jax.device_put(np.asarray(faces, np.int32)[pad].reshape(blocks, chunk, 3)),
+        jax.device_put(low[pad].reshape(blocks, chunk, 2)),
+        jax.device_put(pad.astype(np.int32).reshape(blocks, chunk)),
         height,
         width,
         size,

@@ -2,7 +2,7 @@
 
 import dataclasses
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
@@ -171,7 +171,7 @@ def make_skirt_chart(body: Body, rows: int, columns: int) -> SkirtChart:
     side = rest[faces, 0].mean(axis=1)
     halves = [_nearest(rest, faces[s * side > 0.0], points) for s in (1.0, -1.0)]
     t = np.clip(0.5 + 0.5 * np.sin(2.0 * np.pi * (turn - 0.5)) / _MIDDLE, 0.0, 1.0)
-    share = jnp.asarray((t * t * (3.0 - 2.0 * t)).astype(np.float32))
+    share = jax.device_put((t * t * (3.0 - 2.0 * t)).astype(np.float32))
     return SkirtChart(left=halves[0], right=halves[1], share=share, rows=rows, columns=columns)
 
 
@@ -187,9 +187,9 @@ def _nearest(rest: np.ndarray, faces: np.ndarray, points: np.ndarray) -> Transfe
     nearest = np.asarray(candidates)[rows, np.argmin(squared, axis=1)]
     weights, _ = closest_barycentric(p, *np.moveaxis(vertices[faces[nearest]], 0, 2))
     return Transference(
-        jnp.asarray(faces[nearest].astype(np.int32)),
-        jnp.asarray(weights.T),
-        jnp.asarray(np.ones(len(points), bool)),
+        jax.device_put(faces[nearest].astype(np.int32)),
+        jax.device_put(weights.T),
+        jax.device_put(np.ones(len(points), bool)),
         NUM_BODY_VERTICES,
     )
 
@@ -226,7 +226,7 @@ def skirt_rows(
         texels, face, weights = rasterise(corners, own, rows, columns)
         out[0][texels], out[1][texels], valid[texels] = faces[face], weights, True
     return Transference(
-        jnp.asarray(out[0]), jnp.asarray(out[1]), jnp.asarray(valid), garment.num_vertices
+        jax.device_put(out[0]), jax.device_put(out[1]), jax.device_put(valid), garment.num_vertices
     )
 
 

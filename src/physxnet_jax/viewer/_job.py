@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Literal
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from .._environment import clear_caches_if_full
@@ -137,7 +137,10 @@ class Shown:
         rows = np.arange(frame - dresser.history_length(self.clip.fps), frame + 1)
         rows = np.maximum(rows, 0)
         return frame_maps(
-            dresser, jnp.asarray(self.world[rows]), jnp.asarray(self.shift[rows]), self.clip.fps
+            dresser,
+            jax.device_put(self.world[rows]),
+            jax.device_put(self.shift[rows]),
+            self.clip.fps,
         )
 
 

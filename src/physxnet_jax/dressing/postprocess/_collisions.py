@@ -165,25 +165,27 @@ def make_collider(
         taken = np.concatenate([taken, np.asarray(skirt.table).ravel()])
     used, local = np.unique(taken, return_inverse=True)
     rows, corners = np.unique(faces[used], return_inverse=True)
-    pick = jnp.asarray(rows.astype(np.int32))
+    pick = jax.device_put(rows.astype(np.int32))
     # Reindexed to the vertices and triangles of the collider.
     if skirt is not None:
         middle = np.searchsorted(rows, np.asarray(skirt.middles)).astype(np.int32)
         around = local[table.size :].reshape(skirt.table.shape).astype(np.int32)
-        skirt = dataclasses.replace(skirt, middles=jnp.asarray(middle), table=jnp.asarray(around))
+        skirt = dataclasses.replace(
+            skirt, middles=jax.device_put(middle), table=jax.device_put(around)
+        )
     own = np.asarray(mesh.vertices)
     normals = vertex_normals(own, faces)
     return BodyCollider(
         pick,
-        jnp.asarray(own[rows]),
-        jnp.asarray(normals[rows]),
+        jax.device_put(own[rows]),
+        jax.device_put(normals[rows]),
         body.weights[pick],
-        jnp.asarray(corners.reshape(-1, 3).astype(np.int32)),
-        jnp.asarray(np.searchsorted(rows, places).astype(np.int32)),
-        jnp.asarray(choices.astype(np.int32)),
-        jnp.asarray(local[: table.size].reshape(table.shape).astype(np.int32)),
-        jnp.asarray(minimum_clearance(points, np.asarray(garment.faces))),
-        jnp.asarray(np.full(len(points), np.inf, np.float32)),
+        jax.device_put(corners.reshape(-1, 3).astype(np.int32)),
+        jax.device_put(np.searchsorted(rows, places).astype(np.int32)),
+        jax.device_put(choices.astype(np.int32)),
+        jax.device_put(local[: table.size].reshape(table.shape).astype(np.int32)),
+        jax.device_put(minimum_clearance(points, np.asarray(garment.faces))),
+        jax.device_put(np.full(len(points), np.inf, np.float32)),
         skirt,
         carry,
     )

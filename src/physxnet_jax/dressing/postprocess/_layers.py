@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -138,10 +139,10 @@ def _make_layer(
         else minimum_clearance(points, outward[moved])
     )
     return Layer(
-        jnp.asarray(rows.astype(np.int32)),
-        jnp.asarray(np.ascontiguousarray(faces).astype(np.int32)),
-        jnp.asarray(near[rows].astype(np.int32)),
-        jnp.asarray(least[rows]),
+        jax.device_put(rows.astype(np.int32)),
+        jax.device_put(np.ascontiguousarray(faces).astype(np.int32)),
+        jax.device_put(near[rows].astype(np.int32)),
+        jax.device_put(least[rows]),
         # Hidden cloth needn't be smooth.
         None if under else gaussian_smoothing(points, outward[moved], _SMOOTHING_WIDTH),
         still,

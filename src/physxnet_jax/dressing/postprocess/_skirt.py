@@ -95,7 +95,7 @@ def make_skirt_collider(
     points = np.asarray(garment.vertices)
     rows = hanging_vertices(body, np.asarray(rest), points)
     normals = vertex_normals(points, np.asarray(garment.faces))
-    outward = safe_normalize(np.asarray(carry @ jnp.asarray(normals)))[rows]
+    outward = safe_normalize(np.asarray(carry @ jax.device_put(normals)))[rows]
     # In some files faces are oriented inward.
     if len(rows):
         middle = points[rows].mean(axis=0) * [1, 0, 1]
@@ -111,14 +111,14 @@ def make_skirt_collider(
     table = KDTree(skin[faces].mean(axis=1)).query(skin[chosen], k=_NUM_TRIANGLES)[1]
     lying = np.setdiff1d(np.arange(len(points)), rows)
     return SkirtCollider(
-        jnp.asarray(rows.astype(np.int32)),
-        jnp.asarray(lying.astype(np.int32)),
-        jnp.asarray(np.argsort(np.concatenate([lying, rows])).astype(np.int32)),
-        jnp.asarray(outward),
-        worn.skin[jnp.asarray(rows)],
-        jnp.asarray(chosen.astype(np.int32)),
-        jnp.asarray(near.T.astype(np.int32)),
-        jnp.asarray(table.astype(np.int32)),
+        jax.device_put(rows.astype(np.int32)),
+        jax.device_put(lying.astype(np.int32)),
+        jax.device_put(np.argsort(np.concatenate([lying, rows])).astype(np.int32)),
+        jax.device_put(outward),
+        worn.skin[jax.device_put(rows)],
+        jax.device_put(chosen.astype(np.int32)),
+        jax.device_put(near.T.astype(np.int32)),
+        jax.device_put(table.astype(np.int32)),
     )
 
 

@@ -197,7 +197,7 @@ def carrier(rest: Float[Array, "all 3"], charts: Charts) -> Carrier:
         return jnp.zeros_like(x).at[t["to"]].add(t["share"][:, None] * x[t["from"]])
 
     smooth = jax.lax.fori_loop(0, CARRIER_PASSES, lambda _, x: mean(x), points)
-    normals = vertex_normals(smooth, jnp.asarray(t["faces"]))
+    normals = vertex_normals(smooth, jax.device_put(t["faces"]))
     # Smoothing draws in what bulges; cloth keeps off the highest point around it.
     gap = jnp.maximum(jnp.sum((points - smooth) * normals, axis=1), 0.0)
     for _ in range(2):

@@ -276,8 +276,8 @@ def stored_cut(
     ):
         return None
     start = f"{name}/places/"
-    places = {k[len(start) :]: jnp.asarray(v) for k, v in arrays.items() if k.startswith(start)}
-    return jnp.asarray(arrays[f"{name}/vertices"]), places
+    places = {k[len(start) :]: jax.device_put(v) for k, v in arrays.items() if k.startswith(start)}
+    return jax.device_put(arrays[f"{name}/vertices"]), places
 
 
 def cut_usual(name: str) -> dict[str, np.ndarray]:

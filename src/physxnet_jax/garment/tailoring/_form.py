@@ -55,8 +55,8 @@ def place(
     """Points of the garment at places of a chart [m], on the left and on the right."""
     chart = charts.chart(name)
     index, share = spline(chart.origin.astype(np.float32), uv, chart.fields.shape[:2])
-    weight = jnp.asarray(share)
-    table = jnp.asarray(chart.fields.reshape(-1, 4))
+    weight = jax.device_put(share)
+    table = jax.device_put(chart.fields.reshape(-1, 4))
     fields = jnp.sum(table[index] * weight[..., None], axis=1)
     left, right = (
         _stand(form, name == "skirt", index + charts.start(name, side), weight, fields)
@@ -79,7 +79,7 @@ def ring_points(form: Form, part: str) -> Float[Array, "rings pieces points 3"]:
     """Points of the garment's rings around a part [m]."""
     table = rings(part)
     flat = (x.reshape(-1, x.shape[-1]) for x in (table.nodes, table.weights, table.fields))
-    return _stand(form, table.skirt, *map(jnp.asarray, flat)).reshape(*table.nodes.shape[:3], 3)
+    return _stand(form, table.skirt, *map(jax.device_put, flat)).reshape(*table.nodes.shape[:3], 3)
 
 
 def _stand(form: Form, skirt: bool, nodes: Array, weights: Array, fields: Array) -> Array:

@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -89,7 +90,7 @@ def tailor(
         pinned[pattern.loops[name]] = True
     return Garment(
         make_mesh(worn, pattern.faces, uv, uv_faces, name=kind),
-        jnp.asarray(pinned),
+        jax.device_put(pinned),
         refs,
         weights,
         offset,
@@ -97,7 +98,7 @@ def tailor(
         _fabric(fabric or style.fabric),
         _TEMPLATES.get(style.style, "dress"),
         kind,
-        loops={k: jnp.asarray(e.astype(np.int32)) for k, e in pattern.loops.items()},
+        loops={k: jax.device_put(e.astype(np.int32)) for k, e in pattern.loops.items()},
         elastic=tuple(name for name in style.elastic if name not in hold),
     )
 
@@ -133,7 +134,7 @@ def _attachment(
             start += len(uv)
     skin = np.maximum(skin, 0.0)
     skin /= skin.sum(axis=1, keepdims=True)
-    return jnp.asarray(refs), jnp.asarray(weights), jnp.asarray(skin.astype(np.float32))
+    return jax.device_put(refs), jax.device_put(weights), jax.device_put(skin.astype(np.float32))
 
 
 def _pattern_places(

@@ -97,8 +97,8 @@ class Air(Effect):
             rate = np.linalg.norm(k, axis=1) * max(self.turbulence, 1e-3)
             modes = (float32(k), float32(way), float32(rate), float32(rng.uniform(0, 6.28, _MODES)))
         return _Air(
-            jnp.asarray(f),
-            jnp.asarray(around),
+            jax.device_put(f),
+            jax.device_put(around),
             float32(once)[:, :, None, None],
             float32((0.5 * self.density * share / assembly.mass)[:, None, None]),
             modes,
@@ -121,9 +121,9 @@ class Air(Effect):
         skinned_points = SkinnedPoints(
             float32(skin[rows]),
             float32(vertex_normals(skin, faces)[rows]),
-            assembly.body.weights[jnp.asarray(rows)],
+            assembly.body.weights[jax.device_put(rows)],
         )
-        return _Lee(skinned_points, jnp.asarray(local.reshape(near.shape).astype(np.int32)))
+        return _Lee(skinned_points, jax.device_put(local.reshape(near.shape).astype(np.int32)))
 
 
 _MODES = 16

@@ -62,7 +62,7 @@ class Bend(Effect):
         rows, slot = _sparse_rows(keys // vertices, keys % vertices, vertices)
         index = h.corners.astype(np.int32)
         hinges = _Hinges(
-            tuple(jnp.asarray(index[:, i]) for i in range(4)),
+            tuple(jax.device_put(index[:, i]) for i in range(4)),
             tuple(column(h.coefficient[:, i]) for i in range(4)),
             column(1.0 / np.maximum(h.stiffness, 1e-12)),
             column(h.stiffness * h.area),
@@ -72,9 +72,9 @@ class Bend(Effect):
         typical = max(float(np.quantile(load, 1.0 - _LIMITED)), 1e-12) if len(load) else 1e-12
         return _Bend(
             hinges,
-            jnp.asarray(w.astype(np.float32)),
+            jax.device_put(w.astype(np.float32)),
             rows,
-            jnp.asarray(slot[entry].reshape(len(_PAIRS), -1).astype(np.int32)),
+            jax.device_put(slot[entry].reshape(len(_PAIRS), -1).astype(np.int32)),
             2.0 ** math.ceil(math.log2(typical)),
         )
 
@@ -144,7 +144,7 @@ def _sparse_rows(
     near[rank[first], row[first]] = neighbor[first]
     more[rank[~first] - width, at[row[~first]]] = neighbor[~first]
     slot = np.where(first, rank * vertices + row, near.size + (rank - width) * len(many) + at[row])
-    tables = (jnp.asarray(t.astype(np.int32)) for t in (near, many, more))
+    tables = (jax.device_put(t.astype(np.int32)) for t in (near, many, more))
     return _Rows(*tables), slot
 
 

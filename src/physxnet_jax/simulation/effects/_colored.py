@@ -90,8 +90,8 @@ def color_groups(
         target = np.where(filler[..., None], beyond, corners).astype(np.int32)
         out.append(
             ColorGroup(
-                jnp.asarray(np.stack(member).astype(np.int32)),
-                tuple(jnp.asarray(target[..., c]) for c in range(corners.shape[2])),
+                jax.device_put(np.stack(member).astype(np.int32)),
+                tuple(jax.device_put(target[..., c]) for c in range(corners.shape[2])),
             )
         )
     return order, tuple(out)
@@ -215,7 +215,7 @@ def color_constraints(
     order, parts = color_groups(elements, len(inverse_mass))
     corners = elements[order].T
     return Group(
-        tuple(jnp.asarray(c.astype(np.int32)) for c in corners),
+        tuple(jax.device_put(c.astype(np.int32)) for c in corners),
         tuple(column(inverse_mass[c]) for c in corners),
         {k: column(v[order]) for k, v in law.items()},
         parts,

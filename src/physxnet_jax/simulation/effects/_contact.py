@@ -111,28 +111,28 @@ class BodyContact(Effect):
         local[used] = np.arange(len(used))
         normals = vertex_normals(skin, faces)
         skinned_points = SkinnedPoints(
-            float32(skin[used]), float32(normals[used]), body.weights[jnp.asarray(used)]
+            float32(skin[used]), float32(normals[used]), body.weights[jax.device_put(used)]
         )
         return _Contact(
             samples,
             skinned_points,
             float32(np.stack([relief(skin, normals, r)[used] for r in reaches], 1)),
-            jnp.asarray(part.astype(np.int32)),
-            jnp.asarray(ring.reshape(len(used), -1).T.astype(np.int32)),
-            jnp.asarray(near.T.astype(np.int32)),
+            jax.device_put(part.astype(np.int32)),
+            jax.device_put(ring.reshape(len(used), -1).T.astype(np.int32)),
+            jax.device_put(near.T.astype(np.int32)),
             float32(far[:, -1]),
-            jnp.asarray(local[faces[kept]]),
-            jnp.asarray(tight.astype(np.int32)),
-            jnp.asarray(loose.astype(np.int32)),
-            jnp.asarray(np.argsort(np.concatenate([tight, loose])).astype(np.int32)),
-            jnp.asarray(local[start]),
-            jnp.asarray(local[listed].T),
+            jax.device_put(local[faces[kept]]),
+            jax.device_put(tight.astype(np.int32)),
+            jax.device_put(loose.astype(np.int32)),
+            jax.device_put(np.argsort(np.concatenate([tight, loose])).astype(np.int32)),
+            jax.device_put(local[start]),
+            jax.device_put(local[listed].T),
             float32(assembly.thickness[:, None]),
             float32(assembly.friction[:, None]),
             float32(free[:, None]),
-            jnp.asarray(used.astype(np.int32)),
+            jax.device_put(used.astype(np.int32)),
             prepare_pinch(skin[used], np.asarray(skinned_points.normals), weights[used], body),
-            jnp.asarray(assembly.loose[:, None]),
+            jax.device_put(assembly.loose[:, None]),
             self.push,
             self.leave,
             self.hops,

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
@@ -48,9 +49,9 @@ class Guide(Effect):
         index, weight = _thinned(*pad_rows(means))
         back, back_weight = pad_rows(shares)
         return PreparedGuide(
-            jnp.asarray(index),
+            jax.device_put(index),
             float32(weight),
-            jnp.asarray(np.ascontiguousarray(back.T)),
+            jax.device_put(np.ascontiguousarray(back.T)),
             float32(np.ascontiguousarray(back_weight.T)),
             jnp.float32(self.time_constant),
         )

@@ -118,17 +118,17 @@ class LayerContact(Effect):
             rows, start, side = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros(0)]
         pair = _pairs_of(rows, len(x))
         return _Layers(
-            jnp.asarray(np.concatenate(rows).astype(np.int32)),
-            jnp.asarray(np.concatenate(start).astype(np.int32)),
+            jax.device_put(np.concatenate(rows).astype(np.int32)),
+            jax.device_put(np.concatenate(start).astype(np.int32)),
             float32(np.concatenate(side)[:, None, None]),
-            jnp.asarray(ring.T),
-            jnp.asarray(patch.T),
-            jnp.asarray(outwards.astype(np.int32)),
+            jax.device_put(ring.T),
+            jax.device_put(patch.T),
+            jax.device_put(outwards.astype(np.int32)),
             float32(rim),
-            jnp.asarray(label.astype(np.int32)),
-            jnp.asarray(adjoining()),
-            jnp.asarray(inverse_mass)[:, None, None],
-            jnp.asarray(np.maximum(pair, 0)),
+            jax.device_put(label.astype(np.int32)),
+            jax.device_put(adjoining()),
+            jax.device_put(inverse_mass)[:, None, None],
+            jax.device_put(np.maximum(pair, 0)),
             float32((pair >= 0)[..., None, None]),
             self,
         )

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Int
 
@@ -28,7 +28,7 @@ class Pin(Effect):
             float32(np.zeros((len(rows), 3))),
             float32(assembly.weights[rows]),
         )
-        return _Pin(jnp.asarray(rows.astype(np.int32)), skinned_points)
+        return _Pin(jax.device_put(rows.astype(np.int32)), skinned_points)
 
 
 @pytree

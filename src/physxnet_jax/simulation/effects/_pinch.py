@@ -93,10 +93,10 @@ def prepare_pinch(
     w = 1.0 / (far + 1e-3)
     w = w / w.sum(axis=1, keepdims=True)
     return Pinch(
-        jnp.asarray(pool.astype(np.int32)),
+        jax.device_put(pool.astype(np.int32)),
         # Transposed: the search looks for the other sample along the first axis.
-        jnp.asarray(facing.T),
-        jnp.asarray(facing.any(axis=1, keepdims=True)),
-        jnp.asarray(near.T.astype(np.int32)),
+        jax.device_put(facing.T),
+        jax.device_put(facing.any(axis=1, keepdims=True)),
+        jax.device_put(near.T.astype(np.int32)),
         float32(w.T[..., None]),
     )

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -97,7 +98,7 @@ def sample_faces(
     at = np.asarray(corners, np.int64).reshape(-1, 3)
     w = np.asarray(weights, np.float64).reshape(-1, 3)
     return Samples(
-        jnp.asarray(at.T.astype(np.int32)),
+        jax.device_put(at.T.astype(np.int32)),
         float32(w.T),
         float32((w / np.maximum((w * w).sum(axis=1, keepdims=True), 1e-12)).T),
         float32((w > 0).T),

@@ -65,13 +65,13 @@ class SelfContact(Effect):
         for k in range(3):
             np.add.at(n, f[:, k], np.cross(x[f[:, 1]] - x[f[:, 0]], x[f[:, 2]] - x[f[:, 0]]))
         return _SelfContact(
-            jnp.asarray(x.astype(np.float32)),
-            jnp.asarray(n.astype(np.float32)),
-            jnp.asarray(connected_components(f, len(x))),
-            jnp.asarray(part.astype(np.int32)),
-            jnp.asarray(vertex_faces(f, len(x)).T.astype(np.int32)),
-            jnp.asarray(f.astype(np.int32)),
-            jnp.asarray(inverse_mass)[:, None, None],
+            jax.device_put(x.astype(np.float32)),
+            jax.device_put(n.astype(np.float32)),
+            jax.device_put(connected_components(f, len(x))),
+            jax.device_put(part.astype(np.int32)),
+            jax.device_put(vertex_faces(f, len(x)).T.astype(np.int32)),
+            jax.device_put(f.astype(np.int32)),
+            jax.device_put(inverse_mass)[:, None, None],
             self,
             float(reach),
             float(2.5 * max(most, self.gap)),

@@ -4,6 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -57,11 +58,11 @@ class Stretch(Effect):
         order, parts = color_groups(edges.vertices, len(x))
         a, b = edges.vertices[order].T.astype(np.int32)
         springs = _Springs(
-            (jnp.asarray(a), jnp.asarray(b)),
+            (jax.device_put(a), jax.device_put(b)),
             (column(w[a]), column(w[b])),
             column(length[order]),
             column(compliance[order]),
-            jnp.asarray(opposite[:, order]),
+            jax.device_put(opposite[:, order]),
             float32(modulus[:, order]),
         )
         return _Stretch(springs, parts, 1.0 / self.compression)
