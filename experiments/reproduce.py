@@ -94,6 +94,8 @@ SETS_ALONE = {
         "dresses": "twelve dresses and skirts",
         "bottom": "trousers",
         "bottoms": "twelve trousers and shorts",
+        "top": "shirt",
+        "tops": "twelve shirts and tees",
     }.items()
     for motion, how in {
         "": "training and extra actions",

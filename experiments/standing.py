@@ -3,7 +3,7 @@
 Command: python experiments/standing.py [--weights nano small base]
 Cost:    about ten minutes on one core; goes on where it was stopped.
 Result:  experiments/results/standing.json and .md: for the first second of built-in clips and a
-         person who stands at rest, the default dress and trousers by skinning, by each network,
+         person who stands at rest, the default garments by skinning, by each network,
          and guided: RMSE [mm] against the simulation at `standard`, and by how much higher the hem
          is [mm], over the last half of the frames.
 """
@@ -26,7 +26,7 @@ from physxnet_jax.motion import Motion, load_motion
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 CLIPS = ("rest", "walk", "punch", "balance")
-GARMENTS = ("aline", "trousers")
+GARMENTS = ("shirt", "aline", "trousers")
 FRAMES = 30
 # Vertices of the hem: the lowest ones.
 HEM = 300

@@ -86,6 +86,24 @@ def test_inputs_stay_under_every_name(tmp_path):
     assert path.read_text() == "new"
 
 
+def test_an_input_stays_when_it_is_moved_or_edited_but_its_inode_may_go_to_another(tmp_path):
+    path, moved = tmp_path / "a.txt", tmp_path / "b.txt"
+    path.write_text("old")
+    with keep_inputs():
+        add_inputs(path)
+        os.utime(path, ns=(0, 0))
+        with pytest.raises(FormatError, match="this is an input"):
+            write(path)
+        add_inputs(path)
+        path.rename(moved)
+        with pytest.raises(FormatError, match="this is an input"):
+            write(moved)
+        # As where the input was deleted and a new file took its number.
+        os.utime(moved, ns=(1, 1))
+        write(moved)
+    assert moved.read_text() == "new"
+
+
 def test_what_dead_processes_left_is_removed(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "_swept", set())
     gone = subprocess.run(

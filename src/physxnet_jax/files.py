@@ -31,8 +31,8 @@ _T = TypeVar("_T")
 _FULL = 1_000_000
 _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 _PART = re.compile(r"\.part-([0-9a-f]{8})-(\d+)-")
-# Files that the running command reads, by device and inode.
-_inputs: dict[tuple[int, int], pathlib.Path] = {}
+# Files that the running command reads and their times of change [ns], by device and inode.
+_inputs: dict[tuple[int, int], tuple[pathlib.Path, int]] = {}
 _swept: set[pathlib.Path] = set()
 
 
@@ -53,7 +53,13 @@ def add_inputs(*paths: str | pathlib.Path) -> None:
         with contextlib.suppress(OSError, ValueError):
             if os.path.isfile(path):
                 found = os.stat(path)
-                _inputs[found.st_dev, found.st_ino] = pathlib.Path(path)
+                _inputs[found.st_dev, found.st_ino] = pathlib.Path(path), found.st_mtime_ns
+
+
+def _names(path: pathlib.Path, found: os.stat_result) -> bool:
+    with contextlib.suppress(OSError):
+        return os.path.samestat(os.stat(path), found)
+    return False
 
 
 def check_replaceable(path: str | pathlib.Path) -> None:
@@ -66,8 +72,9 @@ def check_replaceable(path: str | pathlib.Path) -> None:
         found = os.stat(path)
     except OSError:
         return
-    known = _inputs.get((found.st_dev, found.st_ino))
-    if known is not None:
+    known, changed = _inputs.get((found.st_dev, found.st_ino), (None, 0))
+    # A file that was deleted leaves its inode to another, which isn't an input.
+    if known is not None and (found.st_mtime_ns == changed or _names(known, found)):
         same = "" if str(known) == str(path) else f", which is {known}"
         raise FormatError(f"{path}: this is an input{same}. Choose another output.")
     if not os.access(path, os.W_OK) or not found.st_mode & 0o222:

@@ -177,3 +177,12 @@ def test_normals_of_numpy_arrays_are_those_of_jax_arrays():
     np.testing.assert_allclose(found, compiled, rtol=0, atol=1e-6)
     assert not found[:, 8].any()
     assert vertex_normals(vertices[0].astype(np.float64), faces).dtype == np.float64
+
+
+def test_a_mesh_keeps_its_vertices_when_the_array_that_they_came_from_changes():
+    # A device array may share the memory of a large array on a CPU, which depends on its address.
+    arrays = [np.zeros((100_000 + 16 * k, 3), np.float32) for k in range(8)]
+    meshes = [make_mesh(a, [[0, 1, 2]]) for a in arrays]
+    for a in arrays:
+        a[:] = 1.0
+    assert not any(np.asarray(m.vertices).any() for m in meshes)

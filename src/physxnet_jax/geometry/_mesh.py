@@ -60,7 +60,8 @@ def make_mesh(
         >>> mesh.faces.shape
         (1, 3)
     """
-    v = np.asarray(vertices, dtype=np.float32)
+    # A copy: arrays on a CPU may share memory with those that they were made from.
+    v = np.array(vertices, dtype=np.float32)
     if not np.array_equal(np.asarray(faces, dtype=np.float64), np.asarray(faces, dtype=np.int64)):
         raise MeshError(f"{name}: face indices contain fractions, expected whole numbers.")
     f = np.asarray(faces, dtype=np.int64)
@@ -81,7 +82,7 @@ def make_mesh(
         raise MeshError(f"{name}: vertex {row} is not finite ({v[row].tolist()}). Export it again.")
     if uv is None:
         return TriMesh(jax.device_put(v), jax.device_put(f.astype(np.int32)))
-    t = np.asarray(uv, dtype=np.float32)
+    t = np.array(uv, dtype=np.float32)
     tf = f if uv_faces is None else np.asarray(uv_faces, dtype=np.int64)
     if t.ndim != 2 or t.shape[1] != 2 or tf.shape != f.shape:
         raise MeshError(
