@@ -67,7 +67,7 @@ def test_the_first_frame_is_skinned_cloth_near_the_prediction(guided, motion):
         off = np.asarray(x - skinned)[0]
         return np.linalg.norm(off[edges[:, 0]] - off[edges[:, 1]], axis=1).mean()
 
-    assert roughness(found["bottom"]) < 0.7 * roughness(predicted)
+    assert roughness(found["bottom"]) < 0.8 * roughness(predicted)
     # The patches are still where they are predicted, nearly.
     scene = guided.guided
     means = [

@@ -238,8 +238,26 @@ def test_decoders_that_are_not_learned_stay(learned, tmp_path):
     changed = {k for k in was if not np.array_equal(was[k][...], now[k][...])}
     assert changed == {k for k in was if k[:2] == ("decoders", "top") and not is_statistic(was[k])}
     assert set(after.texel_points.valid) == set(model.templates)
+    # The finished run gives what lies between; nothing is learned for it.
+    steps.clear()
+    between = train(
+        dataclasses.replace(config, blend=0.25),
+        [sequence(TIGHT, 0.0), sequence(LOOSE, -OFF)],
+        tmp_path / "run",
+        report=lambda _, total, __: steps.append(total),
+    )
+    assert not steps
+    for k, x in nnx.to_flat_state(between.state):
+        a, b = np.asarray(was[k][...]), np.asarray(now[k][...])
+        if k in changed:
+            np.testing.assert_allclose(x[...], 0.75 * a + 0.25 * b, rtol=1e-5, atol=1e-7)
+        else:
+            np.testing.assert_array_equal(x[...], a)
     for given in ({"learned": ("dress",)}, {"start": ""}):
         with pytest.raises(ValueError, match="learned is"):
+            dataclasses.replace(config, **given)
+    for given in ({"blend": 0.0}, {"blend": 1.5}, {"blend": 0.5, "learned": ()}):
+        with pytest.raises(ValueError, match="blend is"):
             dataclasses.replace(config, **given)
 
 

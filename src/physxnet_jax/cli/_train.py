@@ -74,6 +74,7 @@ def train(command: Train, console: Console) -> int:
                 if config.validation and measured
                 else {}
             ),
+            **({"blend": config.blend} if config.blend < 1.0 else {}),
             **(
                 {"start": config.start, "start_sha256": read_card(config.start)["sha256"]}
                 if config.start

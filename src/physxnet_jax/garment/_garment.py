@@ -1,10 +1,11 @@
 """Garments: rest mesh, material, pins and attachment to the body."""
 
 import dataclasses
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..errors import check_numbers
@@ -140,9 +141,15 @@ class Garment:
         References:
             MakeHuman's mhclo files attach clothes in the same way.
         """
-        carried = rest[self.refs] * self.ref_weights[:, :, None]
+        arrays = (rest, self.refs, self.ref_weights, self.offset)
+        if any(isinstance(x, jax.core.Tracer) for x in arrays):
+            return _carried(jnp.sum, *arrays)
         # Not as one program, which would round otherwise than where the offsets were made.
-        return jnp.sum(carried, axis=1) + self.offset
+        return jax.device_put(_carried(np.sum, *map(np.asarray, arrays)))
+
+
+def _carried(total: Any, rest: Any, refs: Any, weights: Any, offset: Any) -> Any:
+    return total(rest[refs] * weights[:, :, None], axis=1) + offset
 
 
 @jax.jit

@@ -99,5 +99,9 @@ def _plain(state: Stepped) -> list[Any]:
 
 
 def config_json(config: Any, data: str) -> str:
-    """A run as JSON: its config and the identity of its training data."""
-    return json.dumps({**dataclasses.asdict(config), "data": data}, indent=1, sort_keys=True)
+    """A run as JSON: its config and the identity of its training data.
+
+    Without ``blend``, which acts when the run is over.
+    """
+    run = {k: v for k, v in dataclasses.asdict(config).items() if k != "blend"}
+    return json.dumps({**run, "data": data}, indent=1, sort_keys=True)

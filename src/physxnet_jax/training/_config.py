@@ -50,6 +50,9 @@ class TrainConfig:
         learned: Templates whose decoders alone are learned, in evaluation mode: the encoder, other
             decoders and batch statistics stay those of ``start``, and the data need hold no other
             garments. Everything is learned if empty. Only with ``model.conditions``.
+        blend: Share of what was learned in the resulting parameters; the rest is ``start``'s
+            (Wortsman et al., Robust fine-tuning of zero-shot models, 2022). Only with
+            ``learned``.
         seed: Seed of all random numbers.
         precision: Precision of the network's arithmetic; parameters and losses stay float32.
         validation: Names of training actions that are held out for validation. The weights
@@ -84,6 +87,7 @@ class TrainConfig:
     mirror_augmentation: bool = False
     start: str = ""
     learned: tuple[str, ...] = ()
+    blend: float = 1.0
     seed: int = 0
     precision: Literal["float32", "bfloat16"] = "float32"
     validation: tuple[str, ...] = ()
@@ -130,6 +134,10 @@ class TrainConfig:
             raise ValueError(
                 f"learned is {self.learned}; it names templates of model.templates, and needs"
                 " model.conditions and weights to start from."
+            )
+        if not 0.0 < self.blend <= 1.0 or (self.blend < 1.0 and not self.learned):
+            raise ValueError(
+                f"blend is {self.blend}; it must be above 0 and at most 1, and 1 without learned."
             )
         size = self.model.resolution
         if self.pyramid_levels < 1 or size % 2 ** (self.pyramid_levels - 1):

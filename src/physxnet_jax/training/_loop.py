@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence as Items
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 from flax import nnx
@@ -118,9 +119,21 @@ def train(
     run = _Run(folder, repeated(mesh, problem), repeated(mesh, first), data, total, mesh)
     try:
         run.train(total if steps is None else min(steps, total), report)
-        return make_predictor(problem, at_home(run.best()))
+        predictor = make_predictor(problem, at_home(run.best()))
+        return predictor if before is None else _blended(before, predictor, config.blend)
     finally:
         run.close()
+
+
+def _blended(before: Predictor, after: Predictor, share: float) -> Predictor:
+    """A predictor between two; parameters that both have stay as they are."""
+
+    def mix(a: jax.Array, b: jax.Array) -> jax.Array:
+        return a + share * (b - a) if jnp.issubdtype(b.dtype, jnp.inexact) else b
+
+    if share == 1.0:
+        return after
+    return dataclasses.replace(after, state=jax.tree.map(mix, before.state, after.state))
 
 
 class _Run:
