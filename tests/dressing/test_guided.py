@@ -22,6 +22,7 @@ from physxnet_jax.dressing import (
 from physxnet_jax.dressing._guided import _softness
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.geometry import mesh_edges
+from physxnet_jax.models import load_predictor
 from physxnet_jax.motion import load_motion
 from physxnet_jax.simulation import STANDARD
 from physxnet_jax.simulation.effects import Guide
@@ -52,10 +53,22 @@ def step(dresser, stream, q, p, fps=30.0):
 
 
 @pytest.mark.release
-def test_the_first_frame_is_skinned_cloth_near_the_prediction(guided, motion):
-    """Smooth, with its patches where they are predicted; later frames are the simulation's."""
+def test_the_first_frame_is_skinned_cloth_near_the_prediction(motion):
+    """Smooth, with its patches where they are predicted; later frames are the simulation's.
+
+    The weights are rough ones: the packaged ones with a tenth of noise.
+    """
+    nano = load_predictor("nano")
+    leaves, tree = jax.tree.flatten(nano.state)
+    keys = jax.random.split(jax.random.key(0), len(leaves))
+    leaves = [
+        x + 0.1 * jnp.std(x) * jax.random.normal(k, x.shape) if x.ndim == 4 else x
+        for x, k in zip(leaves, keys, strict=True)
+    ]
+    rough = dataclasses.replace(nano, state=jax.tree.unflatten(tree, leaves))
+    guided = make_dresser(["bottom"], method="guided", inference=Inference(weights=rough))
     q, p = motion.rotations[:FRAMES], motion.root[:FRAMES]
-    bare = Inference(weights="nano", strain_iterations=0)
+    bare = Inference(weights=rough, strain_iterations=0)
     predicted = clothe(make_dresser(["bottom"], inference=bare), q, p, 30.0)["bottom"]
     found = cloth_of(guided, q, p)
     assert bool(found.ok.all())
@@ -67,7 +80,7 @@ def test_the_first_frame_is_skinned_cloth_near_the_prediction(guided, motion):
         off = np.asarray(x - skinned)[0]
         return np.linalg.norm(off[edges[:, 0]] - off[edges[:, 1]], axis=1).mean()
 
-    assert roughness(found["bottom"]) < 0.8 * roughness(predicted)
+    assert roughness(found["bottom"]) < 0.7 * roughness(predicted)
     # The patches are still where they are predicted, nearly.
     scene = guided.guided
     means = [
