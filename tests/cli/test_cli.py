@@ -51,6 +51,7 @@ def test_commands_that_print_tables_also_print_json(tmp_path, capsys, monkeypatc
     assert code == 0 and found["files"] == [out] and found["frames"] == 2
     assert found["garments"][0]["vertices"] == 2726 and 0 <= found["garments"][0]["inside"] < 0.1
     assert {s["name"] for s in found["stages"]} >= {"motion", "skinning"}
+    assert found["stages"][-1]["name"] == "other"
     code, found = run_json("simulate", "walk", *common, "--accuracy", "draft")
     assert code == 0 and found["files"] == [out] and "Gravity" in found["effects"]
     assert found["worst"]["strain_p99"] > 0 and found["seconds"] > 0

@@ -2,13 +2,14 @@
 
 import dataclasses
 import gc
+import threading
 
 import numpy as np
 import pytest
 
 from physxnet_jax.dressing import dress
 from physxnet_jax.errors import FormatError
-from physxnet_jax.viewer import render_columns, render_frame, render_preview
+from physxnet_jax.viewer import load_renderer, render_columns, render_frame, render_preview
 
 pytest.importorskip("pyvista")
 
@@ -101,6 +102,53 @@ def test_feet_have_a_shadow_and_backgrounds_their_colour(person):
     assert dark[2, 2].max() < 60
     with pytest.raises(FormatError, match="studio, white"):
         render_frame(person, 0, background="#12")
+
+
+def test_the_shadow_of_a_foot_is_beneath_it_and_lines_stay_where_they_are(person):
+    from physxnet_jax.viewer._studio import _GRID, _PIXELS, _REACH, Studio
+
+    studio = Studio(person, (64, 64))
+    studio.close()
+    pixel = 2 * _REACH / _PIXELS
+    lowest = person[0].positions[5][np.argmin(person[0].positions[5][:, 1])]
+    centre = np.array([0.3, 0.0, -0.2])
+    picture = studio._floor_picture(5, centre).astype(int)
+    column, row = ((lowest - centre)[[0, 2]] / pixel + _PIXELS / 2).astype(int)
+    assert picture[row, column, 3] > 60 and picture[2, 2, 3] == 0
+    # A line is where a coordinate is a multiple of the grid's; half a grid on there is none.
+    # Rows and columns here are far from the feet, whose shadow would hide them.
+    row = _PIXELS // 2 + round((1.0 - centre[2]) / pixel)
+    between = _PIXELS // 2 + round((1.0 + 0.5 * _GRID - centre[2]) / pixel)
+    middle = _PIXELS // 2 + round((0.5 * _GRID - centre[0]) / pixel)
+    assert picture[row - 1 : row + 2, middle, 3].max() > 8
+    assert picture[between - 1 : between + 2, middle, 3].max() < 4
+    moved = studio._floor_picture(5, centre + [0.0, 0.0, _GRID]).astype(int)
+    assert moved[row - 1 : row + 2, middle, 3].max() > 8
+
+
+def test_the_renderer_is_loaded_in_a_thread(monkeypatch):
+    """Where it is missing, whoever draws says so, not the thread."""
+
+    def thread():
+        (found,) = (t for t in threading.enumerate() if t.name == "load the renderer")
+        return found
+
+    missing, started = threading.Event(), threading.Event()
+
+    def fail(name):
+        assert name == "pyvista"
+        started.set()
+        missing.wait(10)
+        raise ImportError(name)
+
+    monkeypatch.setattr("importlib.import_module", fail)
+    load_renderer()
+    assert started.wait(10)
+    running = thread()
+    assert running.daemon
+    missing.set()
+    running.join(10)
+    assert not running.is_alive()
 
 
 @pytest.mark.release

@@ -29,7 +29,7 @@ from ..frames import IN_MEMORY, scratch_folder
 from ..io import GltfFile, check_output, write_clip
 from ..models import read_card
 from ..motion import Motion, declared_too_fast, load_motion, read_motion, slow_subject
-from ..viewer import check_preview, render_preview
+from ..viewer import check_preview, load_renderer, render_preview
 from ._calibrate import choose
 from ._clock import lap
 from ._commands import Demo, Dress, Effects, Simulate
@@ -46,7 +46,7 @@ from ._options import (
 )
 from ._progress import UNWRITTEN, print_json, progress_bars
 from ._shape import parse_shape
-from ._table import closing_table, report, rollout_report, rollout_table
+from ._table import closing_table, milliseconds, report, rollout_report, rollout_table
 
 _Progress = Callable[[str, int, int], None]
 
@@ -314,6 +314,8 @@ def _run(
             release_programs()
         progress(stage, done, total)
 
+    if pictures:
+        load_renderer()
     began = time.perf_counter()
     first = out or (pictures[0] if pictures else None)
     with contextlib.nullcontext() if first is None else scratch_folder(first.absolute().parent):
@@ -343,7 +345,10 @@ def _run(
         options = dataclasses.asdict(look)
         written.append(render_preview(picture, clip.meshes, clip.fps, progress=progress, **options))
         files.append(Stage("preview", 1e3 * (time.perf_counter() - ticks)))
-    return dataclasses.replace(clip, stages=(*job.stages, *clip.stages, *files)), written, seconds
+    stages = (*clip.stages, *files)
+    rest = lap() - sum(milliseconds(clip, s) for s in stages)
+    stages = (*job.stages, *stages, Stage("other", max(rest, 0.0)))
+    return dataclasses.replace(clip, stages=stages), written, seconds
 
 
 def _write(

@@ -22,11 +22,11 @@ def closing_table(clip: DressedClip) -> list[Table]:
     times.add_column("first call (ms)", justify="right")
     times.add_column("warm (ms a frame)", justify="right")
     for stage in clip.stages:
-        whole = f"{_milliseconds(clip, stage):.0f}"
+        whole = f"{milliseconds(clip, stage):.0f}"
         by_frames = stage.warm_ms is not None
         first = f"{stage.cold_ms:.0f}" if by_frames else ""
         times.add_row(stage.name, whole, first, f"{stage.warm_ms:.2f}" if by_frames else "")
-    times.add_row("total", f"{sum(_milliseconds(clip, s) for s in clip.stages):.0f}", "", "")
+    times.add_row("total", f"{sum(milliseconds(clip, s) for s in clip.stages):.0f}", "", "")
     fit = Table(
         title="garments, and their share inside the body before and after collisions",
         title_justify="left",
@@ -60,7 +60,7 @@ def closing_table(clip: DressedClip) -> list[Table]:
     return [times, fit]
 
 
-def _milliseconds(clip: DressedClip, stage: Stage) -> float:
+def milliseconds(clip: DressedClip, stage: Stage) -> float:
     """Time of a whole stage [ms]: of its first block, and of the others at its usual pace."""
     if stage.warm_ms is None:
         return stage.cold_ms

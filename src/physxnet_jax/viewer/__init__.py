@@ -8,6 +8,7 @@ from ._maps import magnified as magnified, texel_picture as texel_picture
 from ._record import record as record
 from ._render import (
     check_preview as check_preview,
+    load_renderer as load_renderer,
     render_columns as render_columns,
     render_frame as render_frame,
     render_preview as render_preview,

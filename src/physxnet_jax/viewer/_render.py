@@ -1,7 +1,10 @@
 """Off-screen rendering of dressed people: pictures and videos."""
 
+import contextlib
+import importlib
 import importlib.util
 import pathlib
+import threading
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -171,6 +174,20 @@ def _moments(frames: int, count: int) -> np.ndarray:
     if count == 1:
         return np.array([frames // 2])
     return np.linspace(0, frames - 1, count).astype(int)
+
+
+def load_renderer() -> None:
+    """Starts to load the renderer in a thread, in the shadow of work that holds no lock.
+
+    Loading takes seconds, while a compiler or a compiled program is often all that runs.
+    """
+
+    def load() -> None:
+        # Whoever draws will report what is missing.
+        with contextlib.suppress(ImportError):
+            importlib.import_module("pyvista")
+
+    threading.Thread(target=load, name="load the renderer", daemon=True).start()
 
 
 def check_preview(

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from scipy.ndimage import gaussian_filter, gaussian_filter1d, zoom
+from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from ..body import NUM_BODY_VERTICES, load_body
 from ..errors import FormatError, MissingDependencyError
@@ -236,6 +236,11 @@ class Studio:
         plane.active_texture_coordinates = np.stack(
             [0.5 + x[:, 0] / (2 * _REACH), 0.5 - x[:, 2] / (2 * _REACH)], axis=1
         ).astype(np.float32)
+        # Lines and shadow fade away from the person.
+        at = (np.arange(_PIXELS) + 0.5) * 2 * _REACH / _PIXELS - _REACH
+        radius = np.hypot(at[:, None], at[None])
+        fade = np.clip((_REACH - radius) / (0.7 * _REACH), 0.0, 1.0).astype(np.float32)
+        self._line_alpha, self._shade_alpha = 0.22 * fade**2, 0.5 * fade**0.5
         blank = pyvista.Texture(np.zeros((_PIXELS, _PIXELS, 4), np.uint8))
         return self.plotter.add_mesh(plane, texture=blank, lighting=False, reset_camera=False)
 
@@ -257,9 +262,13 @@ class Studio:
         picture.interpolate = True
         self._ground.texture = picture
         eye = self._eyes[frame]
-        self.plotter.camera_position = [tuple(eye), tuple(target), (0.0, 1.0, 0.0)]
-        self.plotter.camera.view_angle = _VIEW
-        self.plotter.camera.clipping_range = (0.05, 100.0)
+        # pyvista's own setters look through all meshes for the range of depths.
+        camera = self.plotter.camera
+        camera.SetPosition(*eye)
+        camera.SetFocalPoint(*target)
+        camera.SetViewUp(0.0, 1.0, 0.0)
+        camera.SetViewAngle(_VIEW)
+        camera.SetClippingRange(0.05, 100.0)
         # A screenshot alone would show the meshes from the camera's previous position.
         self.plotter.render()
         picture = Image.fromarray(np.asarray(self.plotter.screenshot(return_img=True)))
@@ -269,8 +278,10 @@ class Studio:
         self, frame: int, centre: Float[np.ndarray, "3"]
     ) -> UInt8[np.ndarray, "rows columns 4"]:
         """Lines that stay in their place and a soft shadow, over nothing."""
+        from PIL import Image
+
         pixel = 2 * _REACH / _PIXELS
-        shade = np.zeros((_PIXELS, _PIXELS), np.float32)
+        light = np.ones((_PIXELS, _PIXELS), np.float32)
         x = np.concatenate([m.positions[frame] for m in self.meshes])
         height = x[:, 1] - self.floor
         bottom = -np.inf
@@ -285,27 +296,28 @@ class Studio:
             there = (np.minimum(u, v) >= 0) & (np.maximum(u, v) < pixels)
             covered = np.zeros((pixels, pixels), np.float32)
             covered[v[there].astype(int), u[there].astype(int)] = 1.0
-            covered = gaussian_filter(covered, blur / size)
+            covered = strength * np.clip(1.6 * gaussian_filter(covered, blur / size), 0.0, 1.0)
             if pixels < _PIXELS:
-                covered = np.asarray(
-                    zoom(covered, _PIXELS // pixels, order=1, grid_mode=True, mode="nearest")
+                larger = Image.fromarray(covered).resize(
+                    (_PIXELS, _PIXELS), Image.Resampling.BILINEAR
                 )
-            shade = 1.0 - (1.0 - shade) * (1.0 - strength * np.clip(1.6 * covered, 0.0, 1.0))
+                covered = np.asarray(larger)
+            light *= 1.0 - covered
         at = (np.arange(_PIXELS) + 0.5) * pixel - _REACH
-        lines = np.zeros((_PIXELS, _PIXELS))
-        for axis, offset in ((0, centre[2]), (1, centre[0])):
-            gap = np.abs((at + offset + 0.5 * _GRID) % _GRID - 0.5 * _GRID)
-            line = np.clip(1.0 - gap / (1.1 * pixel), 0.0, 1.0)
-            lines = np.maximum(lines, line[:, None] if axis == 0 else line[None])
-        radius = np.hypot(at[:, None], at[None])
-        fade = np.clip((_REACH - radius) / (0.7 * _REACH), 0.0, 1.0)
-        out = np.zeros((_PIXELS, _PIXELS, 4))
-        alpha_line, alpha_shade = 0.22 * lines * fade**2, 0.5 * shade * fade**0.5
-        out[..., :3] = (self._line * alpha_line / np.maximum(alpha_line + alpha_shade, 1e-6))[
-            ..., None
-        ]
-        out[..., 3] = 255 * (alpha_line + alpha_shade - alpha_line * alpha_shade)
-        return out.astype(np.uint8)
+        row, column = (
+            np.clip(
+                1.0 - np.abs((at + offset + 0.5 * _GRID) % _GRID - 0.5 * _GRID) / (1.1 * pixel),
+                0.0,
+                1.0,
+            ).astype(np.float32)
+            for offset in (centre[2], centre[0])
+        )
+        line = self._line_alpha * np.maximum(row[:, None], column[None])
+        shade = self._shade_alpha * (1.0 - light)
+        out = np.empty((_PIXELS, _PIXELS, 4), np.uint8)
+        out[..., :3] = (self._line * line / np.maximum(line + shade, 1e-6))[..., None]
+        out[..., 3] = 255 * (line + shade - line * shade)
+        return out
 
     def _load_texture(self, texture: Texture) -> Any:
         import imageio.v2 as imageio
