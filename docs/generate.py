@@ -153,7 +153,8 @@ def scene_page() -> str:
     lines += [
         "",
         "A garment is a word as for `--wear` (`shirt:ease=0.12`, `coat.obj:unit=cm`), or a table",
-        "of `file` and `fabric`. A [fabric](fabrics.md) is a name or a table of numbers.",
+        "of `file`, `fabric` and `pin`. A [fabric](fabrics.md) is a name or a table of numbers,",
+        "`pin` a list of vertices that move with the skin, numbered from 0 as in the result.",
         "",
         "## Effects",
         "",

@@ -14,6 +14,7 @@ from physxnet_jax.cli._progress import print_json
 from physxnet_jax.dressing import (
     Inference,
     Simulation,
+    dress,
     load_scene,
     make_dresser,
     make_scene,
@@ -150,6 +151,41 @@ def test_fabrics_of_scene_files_may_be_numbers(tmp_path):
     write_scene(copy, read, read.scene.effects)
     again = load_scene(copy)
     assert again.scene.garments[0].fabric == fabric and again.scene.effects == read.scene.effects
+
+
+@pytest.mark.release
+def test_chosen_vertices_are_pinned(tmp_path):
+    path, copy, out = (tmp_path / n for n in ("scene.toml", "copy.toml", "a.npz"))
+    text = (
+        'motion = "walk"\nframes = 3\naccuracy = "draft"\n[[garments]]\nfile = "bottom"\n'
+        "pin = [5, 2000]\n"
+    )
+    path.write_text(text)
+    read = load_scene(path)
+    (garment,) = read.scene.garments
+    own = np.asarray(template("bottom").pinned)
+    assert not own[[5, 2000]].any(), "the control: they aren't pinned otherwise"
+    added = np.flatnonzero(np.asarray(garment.pinned) & ~own)
+    assert added.tolist() == [5, 2000]
+    write_scene(copy, read, read.scene.effects)
+    assert (np.asarray(load_scene(copy).scene.garments[0].pinned) == garment.pinned).all()
+    inference = Inference(collisions=False)
+    clip = dress("walk", "bottom", method="lbs", inference=inference, frames=3)
+    skinned = np.asarray(clip.garments[0].positions)
+    assert main(["simulate", str(path), "-o", str(out), "--quiet"]) == 0
+    with np.load(out) as data:
+        away = np.linalg.norm(data["bottom_positions"] - skinned, axis=-1)
+    assert away[:, [5, 2000]].max() < 1e-5 and away[:, ~own].max() > 1e-3
+    for pins, why in (
+        ("[2726]", "no vertex 2726; its 2726"),
+        ("[-1]", "first of which is 0"),
+        ("5", "list of vertex"),
+        ("[1.5]", "list of vertex"),
+        ("[true]", "list of vertex"),
+    ):
+        path.write_text(text.replace("[5, 2000]", pins))
+        with pytest.raises(FormatError, match=why):
+            load_scene(path)
 
 
 def test_scenes_keep_custom_effects_and_refuse_duplicates():

@@ -10,6 +10,7 @@ from flax import nnx
 from physxnet_jax.dressing import AdaptConfig, Inference, adapt, make_dresser
 from physxnet_jax.errors import MotionError, PhysXNetError, WeightsError
 from physxnet_jax.models import fold_batch_norm, load_predictor
+from physxnet_jax.motion import load_motion
 
 CONFIG = AdaptConfig(steps=4, windows=1, frames=3, learning_rate=3e-4, validate_every=2)
 SHORT = {"weights": "nano", "frames": 6, "config": CONFIG}
@@ -95,6 +96,8 @@ def test_what_cannot_be_adapted_is_refused():
         AdaptConfig(potential=-1.0)
     with pytest.raises(MotionError, match="shorter than a window"):
         adapt("bottom", weights="nano", frames=5)
+    with pytest.raises(MotionError, match="shorter than a window"):
+        adapt("bottom", weights="nano", motions=[load_motion("walk", fps=30.0)[:5]])
     nano = load_predictor("nano")
     with pytest.raises(WeightsError, match="as it was loaded"):
         adapt("bottom", weights=dataclasses.replace(nano, mirror_tta=True))

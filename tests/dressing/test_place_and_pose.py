@@ -98,6 +98,15 @@ def test_ten_kilometres_away_the_dressed_person_is_the_same(motion, method):
         np.testing.assert_array_equal(seen, found.garments[0].positions)
 
 
+def test_places_where_single_precision_is_coarse_are_noted(motion):
+    for away, expected in ((5e4, ("50 km",)), (1e4, ())):
+        moved = motion[:2].moved(np.array([away, 0.0, 0.0], np.float32))
+        notes = dress(moved, ["bottom"], method="lbs").notes
+        found = [n for n in notes if "single precision" in n]
+        assert len(found) == len(expected)
+        assert all(e in n and "steps of 4 mm" in n for e, n in zip(expected, found, strict=True))
+
+
 @pytest.mark.release
 def test_a_stream_follows_a_person_who_walks_away(dresser, motion):
     """Over the distance at which its place moves; without contact, which rounding can switch."""

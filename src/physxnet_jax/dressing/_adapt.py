@@ -120,12 +120,12 @@ def adapt(
     began = time.perf_counter()
     body = load_body()
     rest = body.rest_vertices(body.default_shape() if shape is None else shape)
+    every = (*(n for n in CLIPS if n != held_out), *motions, held_out)
+    clips = _load_clips(every, body, shape, frames, config.frames)
     (worn,), _ = resolve_garments(garment, body, shape)
     predictor = load_predictor(weights) if not isinstance(weights, Predictor) else weights
     predictor = with_body(predictor, body, rest)
     _check_plain(predictor)
-    every = (*(n for n in CLIPS if n != held_out), *motions, held_out)
-    clips = _load_clips(every, body, shape, frames, config.frames)
     scene = prepare_scene(build_scene([worn], body, shape, Simulation()))
     solver = PRESETS["standard"]
     folder = None
@@ -161,6 +161,8 @@ def _load_clips(
     frames: int | None,
     least: int,
 ) -> list[Motion]:
+    if frames is not None and frames < least:
+        raise MotionError(f"frames is {frames}, shorter than a window of {least} frames.")
     clips = [prepare_motion(m, fps=FPS, body=body, shape=shape, frames=frames) for m in motions]
     if short := [m.name for m in clips if m.num_frames < least]:
         raise MotionError(f"{short[0]} is shorter than a window of {least} frames.")

@@ -50,6 +50,8 @@ INFERENCE_STAGES = tuple(name for method, name in _STAGES.items() if method != "
 Progress = Callable[[str, int, int], None]
 # A character's lowest point within this of 0 stands on the floor at 0 [m].
 _ON_FLOOR = 0.05
+# Steps of single precision at the first frame beyond which a note is due [m].
+_COARSE = 1e-3
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -465,12 +467,25 @@ def _assemble_clip(
         notes=(
             *(() if fault is None else (fault,)),
             *(() if character is None else character.notes),
+            *_far_note(person.place),
             *_slide_note(cloth.rollout),
             *notes,
         ),
         worst=worst,
         rollout=rollout,
         effects=cloth.effects,
+    )
+
+
+def _far_note(place: Float[np.ndarray, "3"]) -> tuple[str, ...]:
+    """A note if single precision is coarse where the person stands."""
+    farthest = float(np.abs(place).max())
+    apart = float(np.spacing(np.float32(farthest)))
+    if apart <= _COARSE:
+        return ()
+    return (
+        f"the person starts {farthest / 1e3:.0f} km from the origin, where single precision has"
+        f" steps of {1e3 * apart:.0f} mm; move the motion nearer",
     )
 
 

@@ -8,10 +8,11 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
+import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import load_body
-from ..errors import FormatError
+from ..errors import FormatError, MeshError
 from ..files import add_inputs, atomic_write, is_file
 from ..garment import (
     FABRICS,
@@ -47,6 +48,8 @@ SCENE_KEYS: dict[str, type | tuple[type, ...]] = {
     "effects": dict,
 }
 """Keys of a scene file, and the types of their values."""
+GARMENT_KEYS = ("file", "fabric", "pin")
+"""Keys of a garment's table."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -239,6 +242,7 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         [[garments]]               # instead of the list, to choose fabrics
         file = "shirt"
         fabric = "silk"            # or numbers: {density = 0.15, stretch = 300.0}
+        pin = [0, 17]              # vertices that move with the skin, besides its own pins
 
         [effects.air]              # in addition to the standard ones; alone with standard = false
         wind = [0.0, 0.0, 4.0]
@@ -257,10 +261,12 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
         path, _resolve_path(path, text["motion"]), *(parse_wear(str(w)).name for w in places)
     )
     worn, notes = resolve_garments(places, load_body(), shape)
-    garments = [
-        with_fabric(w, fabric_of(g["fabric"])) if "fabric" in g else w
-        for w, g in zip(worn, words, strict=True)
-    ]
+    try:
+        garments = [
+            _with_options(garment, table) for garment, table in zip(worn, words, strict=True)
+        ]
+    except MeshError as error:
+        raise FormatError(f"{path}: {error}") from None
     listed = _parse_effects(path, text.get("effects", {}))
     standard = text.get("standard", True)
     scene_file = make_scene(
@@ -294,12 +300,20 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
     keys = _scene_keys(_resolve_path(path, text["motion"]), files, options)
     for entry, g, n in zip(keys["garments"], words, numbers, strict=True):
         entry |= {"fabric": g["fabric"]} if n else {}
+        entry |= {"pin": g["pin"]} if "pin" in g else {}
     return dataclasses.replace(
         scene_file,
         keys=keys,
         notes=(*scene_file.notes, *notes),
         lists_effects=bool(listed),
     )
+
+
+def _with_options(garment: Garment, table: dict[str, Any]) -> Garment:
+    """A garment with the fabric and the pins of its table."""
+    if "fabric" in table:
+        garment = with_fabric(garment, fabric_of(table["fabric"]))
+    return garment.with_pins(np.asarray(table["pin"], np.int64)) if "pin" in table else garment
 
 
 def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, Any]]]:
@@ -339,8 +353,13 @@ def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, Any]
     ]
     for g in words:
         keys = set(g) if isinstance(g, dict) else {str(g)}
-        if keys - {"file", "fabric"} or not isinstance(g.get("file", ""), str):
-            raise FormatError(f"{path}: a garment takes file and fabric, not {', '.join(keys)}.")
+        if keys - set(GARMENT_KEYS) or not isinstance(g.get("file", ""), str):
+            raise FormatError(
+                f"{path}: a garment takes {', '.join(GARMENT_KEYS)}, not {', '.join(keys)}."
+            )
+        pins = g.get("pin", [])
+        if not isinstance(pins, list) or not all(type(n) is int and 0 <= n < 2**31 for n in pins):
+            raise FormatError(f"{path}: pin is a list of vertex numbers, the first of which is 0.")
         if "file" not in g:
             raise FormatError(f"{path}: a garment has no file.")
         if "fabric" in g:

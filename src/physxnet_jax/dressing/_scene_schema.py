@@ -23,7 +23,7 @@ _ABOUT = {
     "frames": "keep only this many frames; all by default",
     "accuracy": "accuracy of the simulation",
     "substeps": "steps a frame at 30 frames per second, in place of those of the accuracy",
-    "garments": "garments as for --wear, in any order; or tables of `file` and `fabric`",
+    "garments": "garments as for --wear, in any order; or tables of `file`, `fabric` and `pin`",
     "shape": "shape parameters of the body by name (`physxnet clips` lists them)",
     "standard": "whether the standard effects act too",
     "effects": "effects by name, each a table of settings; one replaces a standard one of its kind",
@@ -99,6 +99,11 @@ def scene_schema() -> dict[str, Any]:
         "properties": {
             "file": {"type": "string", "description": "a garment as for --wear"},
             "fabric": {"anyOf": [{"enum": list(FABRICS)}, fabric]},
+            "pin": {
+                "type": "array",
+                "items": {"type": "integer", "minimum": 0},
+                "description": "numbers of vertices that move with the skin, besides its own pins",
+            },
         },
         "required": ["file"],
         "additionalProperties": False,

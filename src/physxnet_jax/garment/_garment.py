@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..errors import check_numbers
+from ..errors import MeshError, check_numbers
 from ..geometry import Polygons, TriMesh
 from ..typing import pytree
 
@@ -124,6 +124,25 @@ class Garment:
     coarse_faces: Int[Array, "coarse 3"] | None = None
     loops: dict[str, Int[Array, "edges 2"]] = dataclasses.field(default_factory=dict)
     elastic: tuple[str, ...] = dataclasses.field(default=(), metadata={"static": True})
+
+    def with_pins(self, vertices: Int[np.ndarray, " pins"]) -> "Garment":
+        """The garment with further vertices that follow the body's skin.
+
+        Args:
+            vertices: Their numbers.
+
+        Raises:
+            MeshError: There is no such vertex.
+        """
+        if len(vertices) and not 0 <= vertices.min() <= vertices.max() < self.num_vertices:
+            wrong = vertices.max() if vertices.min() >= 0 else vertices.min()
+            raise MeshError(
+                f"{self.name}: no vertex {wrong}; its {self.num_vertices} vertices are numbered"
+                " from 0."
+            )
+        pinned = np.array(self.pinned)
+        pinned[vertices] = True
+        return dataclasses.replace(self, pinned=jax.device_put(pinned))
 
     @property
     def num_vertices(self) -> int:
