@@ -102,6 +102,7 @@ SETS_ALONE = {
         "_mixed": "legs with other upper bodies, wider",
         "_left_out": "what the protocol leaves out",
         "_still": "people who stand almost still",
+        "_slow": "at half the speed",
     }.items()
 }
 # The promise under which tests/evaluation/test_stress_controls.py records.
