@@ -102,7 +102,6 @@ SETS_ALONE = {
         "_mixed": "legs with other upper bodies, wider",
         "_left_out": "what the protocol leaves out",
         "_still": "people who stand almost still",
-        "_slow": "at half the speed",
     }.items()
 }
 # The promise under which tests/evaluation/test_stress_controls.py records.
@@ -112,7 +111,7 @@ ABRUPT = ("strong gesture", "jump", "punch")
 COPIED = (
     *("oracle", "accuracy_cost", "peers", "engines", "training"),
     *("blender_import", "blender_extension", "layers", "adapt", "unseen", "laptop"),
-    *("losses", "guided", "standing"),
+    *("losses", "guided", "standing", "history", "fine_garments"),
 )
 DOCUMENTS = (
     *("docs/reproduction.md", "docs/accuracy-cost.md", "docs/garments.md"),

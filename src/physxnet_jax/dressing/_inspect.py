@@ -22,13 +22,13 @@ from ..garment import (
     MeshHealth,
     Opening,
     Template,
-    align_to_template,
     clearance,
     garment_of,
     guess_template,
     hangs_off,
     locate_on_body,
     mesh_health,
+    most_alike,
     parse_wear,
     place_mesh,
     template,
@@ -211,7 +211,7 @@ def _size(raw: StaticMesh) -> tuple[float, ...]:
 def _misplaced(path: pathlib.Path, raw: StaticMesh, body: Body, problem: str) -> Inspection:
     """The inspection of a mesh that no unit and up axis places on the body."""
     # Suggests the template whose place it fits best; the user may choose another.
-    nearest = min(TEMPLATES, key=lambda t: align_to_template(raw, template(t), body)[2])
+    nearest, _, _ = most_alike(raw, [template(t) for t in TEMPLATES], body)
     health = mesh_health(make_mesh(raw.vertices, raw.faces, raw.uv, raw.uv_faces))
     nan = float("nan")
     return Inspection(
@@ -378,9 +378,7 @@ def _better_placement(
     raw: StaticMesh, distance: np.ndarray, body: Body
 ) -> tuple[Template, str] | None:
     """A template whose place a garment fits better than its own, and how; None if there is none."""
-    placements = {name: align_to_template(raw, template(name), body) for name in TEMPLATES}
-    name: Template = min(TEMPLATES, key=lambda n: placements[n][2])
-    placed, description, _ = placements[name]
+    name, placed, description = most_alike(raw, [template(t) for t in TEMPLATES], body)
     there, _ = clearance(body.rest_mesh(), np.asarray(placed.vertices, np.float32))
     now, then = (float(np.mean(x < NEAREST)) for x in (distance, there))
     nearer = float(np.mean(np.abs(there))) < _DISTANCE_RATIO * float(np.mean(np.abs(distance)))

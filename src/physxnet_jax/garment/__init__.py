@@ -1,6 +1,6 @@
 """Garments: templates, fitting and materials, independent of simulation."""
 
-from ._align import align_to_template as align_to_template
+from ._align import align_to_template as align_to_template, most_alike as most_alike
 from ._decimate import decimate as decimate
 from ._fabric import fabric_of as fabric_of, find_fabric as find_fabric
 from ._fit import clearance as clearance, lift_out as lift_out

@@ -21,14 +21,15 @@ from ..geometry import (
     vertex_normals,
 )
 
+Clearance = tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]
+"""Signed distances to the body [m], and directions away from it."""
+
 _ROWS = 2048
 # Hanging cloth farther from the skin than this isn't lifted off it [m].
 _NEAR = 0.03
 
 
-def clearance(
-    body: TriMesh, points: Float[np.ndarray, "points 3"]
-) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]:
+def clearance(body: TriMesh, points: Float[np.ndarray, "points 3"]) -> Clearance:
     """Signed distance to the body [m] and the direction away from it.
 
     The direction is the body's smooth normal at the closest point, which doesn't
@@ -57,6 +58,7 @@ def set_clearance(
     *,
     free: Float[np.ndarray, " vertices"] | None = None,
     iterations: int = 12,
+    known: Clearance | None = None,
 ) -> Float[np.ndarray, "vertices 3"]:
     """Moves a garment to a target distance from the skin while keeping it smooth.
 
@@ -71,6 +73,7 @@ def set_clearance(
         free: 1 where the garment may be farther away (it hangs), 0 where it is held
             at the target.
         iterations: Passes.
+        known: `clearance` of the vertices, if it is known.
 
     Returns:
         New positions [m].
@@ -78,7 +81,7 @@ def set_clearance(
     v = np.asarray(vertices, dtype=np.float64).copy()
     loose = np.zeros(len(v)) if free is None else free
     average = smoothing_matrix(faces, len(v))
-    distance, away = (x.copy() for x in clearance(body, v))
+    distance, away = (x.copy() for x in (known or clearance(body, v)))
     # What hangs far from the skin never comes near it.
     near = np.flatnonzero((loose < 1) | (distance < target + _NEAR))
     for step in range(iterations):
@@ -100,6 +103,7 @@ def lift_out(
     nearest: float,
     *,
     iterations: int = 8,
+    known: Clearance | None = None,
 ) -> tuple[Float[np.ndarray, "vertices 3"], Bool[np.ndarray, " vertices"]]:
     """Moves a garment out of the skin to a minimum distance.
 
@@ -111,11 +115,13 @@ def lift_out(
         faces: Garment triangles.
         nearest: Minimum distance [m].
         iterations: Passes of `set_clearance`.
+        known: `clearance` of the vertices, if it is known.
 
     Returns:
         New positions [m], and which vertices were closer than the minimum.
     """
-    distance, _ = clearance(body, vertices)
+    known = known or clearance(body, vertices)
+    distance, _ = known
     low = distance < nearest
     if not low.any():
         return vertices, low
@@ -127,6 +133,7 @@ def lift_out(
         np.full(count, nearest),
         free=np.ones(count),
         iterations=iterations,
+        known=known,
     )
     return np.where((distance < 3 * nearest)[:, None], moved, vertices), low
 

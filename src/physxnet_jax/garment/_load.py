@@ -273,8 +273,8 @@ def garment_of(
     """Makes a garment of a mesh that was placed on the body, and its report."""
     v, unit, up = placement.vertices, placement.unit, placement.up
     mesh = body.rest_mesh()
-    distance, _ = clearance(mesh, v)
-    moved, inside = lift_out(mesh, v, raw.faces, NEAREST)
+    known = distance, _ = clearance(mesh, v)
+    moved, inside = lift_out(mesh, v, raw.faces, NEAREST, known=known)
     kind = guess_template(moved, raw.faces) if kind is None else kind
     garment = carried(
         make_mesh(moved, raw.faces, raw.uv, raw.uv_faces, name=str(path)),

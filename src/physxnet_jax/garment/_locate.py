@@ -263,8 +263,14 @@ def nearest_skin(
 
 def _smooth_far(weights: np.ndarray, faces: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """Smooths skinning weights over the mesh where the skin is far away."""
-    average = smoothing_matrix(faces, len(weights))
+    weights = weights.astype(np.float64)
     share = np.clip((distance - 0.02) / 0.04, 0.0, 1.0)[:, None]
-    for _ in range(60):
-        weights = weights + share * (average @ weights - weights)
+    far = np.flatnonzero(share)
+    if len(far):
+        average, share = smoothing_matrix(faces, len(weights))[far], share[far]
+        joints = np.flatnonzero(weights.any(axis=0))
+        some = np.ascontiguousarray(weights[:, joints])
+        for _ in range(60):
+            some[far] += share * (average @ some - some[far])
+        weights[:, joints] = some
     return weights / weights.sum(axis=1, keepdims=True)

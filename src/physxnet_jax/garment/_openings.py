@@ -7,6 +7,9 @@ from jaxtyping import Float, Int
 
 # Openings of a smaller circumference hold no limb: buttonholes, slits [m].
 SMALLEST = 0.15
+_Vectors = Float[np.ndarray, "3 #rows #columns"]
+# Points of a border that are enough to see what passes through it.
+_POINTS = 256
 
 
 class Opening(NamedTuple):
@@ -47,6 +50,7 @@ def openings(
         around = float(np.linalg.norm(ring - np.roll(ring, 1, axis=0), axis=1).sum())
         if around < SMALLEST:
             continue
+        ring = ring[:: max(1, len(ring) // _POINTS)]
         through = tuple(name for name, line in limbs.items() if _crossings(ring, line) % 2)
         out.append(Opening(loop, around, through))
     return sorted(out, key=lambda o: -o.around)
@@ -58,18 +62,20 @@ def _crossings(ring: Float[np.ndarray, "n 3"], line: Float[np.ndarray, "points 3
     # Limbs often pass through the very centre, where all triangles meet.
     apex = ring.mean(axis=0)
     apex = apex + 0.013 * (ring[0] - apex) + 0.007 * (ring[len(ring) // 3] - apex)
-    e1, e2 = a - apex, b - apex
-    count = 0
-    for start, end in zip(line[:-1], line[1:], strict=True):
-        d = end - start
-        p = np.cross(d, e2)
-        det = np.einsum("nc,nc->n", e1, p)
-        s = start - apex
-        with np.errstate(all="ignore"):
-            u = (p @ s) / det
-            q = np.cross(s, e1)
-            v = (q @ d) / det
-            t = np.einsum("nc,nc->n", e2, q) / det
-            inside = (u >= 0) & (v >= 0) & (u + v < 1)
-        count += int(((np.abs(det) > 1e-15) & inside & (t >= 0) & (t < 1)).sum())
-    return count
+    # Rows are segments of the line, columns the fan's triangles.
+    e1, e2 = (x.T[:, None] for x in (a - apex, b - apex))
+    d, s = (x.T[:, :, None] for x in (line[1:] - line[:-1], line[:-1] - apex))
+    p, q = _cross(d, e2), _cross(s, e1)
+    det = _dot(e1, p)
+    with np.errstate(all="ignore"):
+        u, v, t = _dot(p, s) / det, _dot(q, d) / det, _dot(e2, q) / det
+        inside = (u >= 0) & (v >= 0) & (u + v < 1)
+    return int(((np.abs(det) > 1e-15) & inside & (t >= 0) & (t < 1)).sum())
+
+
+def _cross(a: _Vectors, b: _Vectors) -> _Vectors:
+    return np.stack([a[i] * b[j] - a[j] * b[i] for i, j in ((1, 2), (2, 0), (0, 1))])
+
+
+def _dot(a: _Vectors, b: _Vectors) -> Float[np.ndarray, "rows columns"]:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

@@ -1,5 +1,6 @@
 """Searches for the unit, axes, pose and position that put a garment's mesh on the body."""
 
+import copy
 import dataclasses
 import itertools
 import math
@@ -190,8 +191,6 @@ class Search:
         vertices: Vertices in the file's unit and axes.
         faces: Triangles.
         poses: The body in its poses.
-        region: Vertices of the template that it is aligned with [m]: it may not reach beyond
-            its height by much, and its bounding box is one more known frame.
     """
 
     def __init__(
@@ -199,14 +198,35 @@ class Search:
         vertices: Float[np.ndarray, "vertices 3"],
         faces: Int[np.ndarray, "faces 3"],
         poses: dict[str, PosedBody],
-        region: Float[np.ndarray, "others 3"] | None = None,
     ) -> None:
-        self.region = None if region is None else (region.min(axis=0), region.max(axis=0))
+        self.region: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None
+        self.costs: dict[tuple[str, str, int, float, bytes], float] = {}
         self.vertices, self.poses = drawn_in(np.asarray(vertices, np.float64)), poses
         self.coarse = surface_points(self.vertices, faces, _COARSE)
         self.fine = surface_points(self.vertices, faces, _FINE)
         self.loops = boundary_loops(faces)
+        self.rims = np.unique(np.concatenate([np.zeros(0, int), *self.loops]))
+        self.box = np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
         self.floor = float(np.asarray(poses["rest"].skin.vertices)[:, 1].min())
+
+    def for_region(self, region: Float[np.ndarray, "others 3"]) -> "Search":
+        """The search for a template's place, which shares what is known of other places.
+
+        Args:
+            region: Vertices of the template [m]: the mesh may not reach beyond its height by
+                much, and its bounding box is one more known frame.
+        """
+        other = copy.copy(self)
+        other.region = region.min(axis=0), region.max(axis=0)
+        return other
+
+    def _misfit(self, scale: float, turn: Turn, pose: str, shift: np.ndarray) -> float:
+        """Misfit of the coarse points [m], computed once."""
+        key = (pose, turn.up, turn.degrees, scale, shift.tobytes())
+        if key not in self.costs:
+            points = self.coarse @ turn.matrix.T * scale + shift
+            self.costs[key] = misfit(self.poses[pose], points)[0]
+        return self.costs[key]
 
     def judge(
         self, unit: str, scale: float, turn: Turn, pose: str, shift: np.ndarray, frame: str
@@ -218,8 +238,11 @@ class Search:
             return x @ turn.matrix.T * scale + shift
 
         fit, near, inside = misfit(posed, place(self.fine))
-        found = openings(place(self.vertices), self.loops, posed.limbs)
-        cost = fit + self._evidence(place(self.vertices), found, pose)
+        # Of its vertices, only those of its borders are read.
+        rims = np.zeros_like(self.vertices)
+        rims[self.rims] = place(self.vertices[self.rims])
+        found = openings(rims, self.loops, posed.limbs)
+        cost = fit + self._evidence(rims, found, pose)
         cost += self._outside(place(self.fine))
         cost += _POSED * (pose != "rest") + _turned(turn) + _RARE.get(frame, 0.0)
         if frame == "found" and self.region is None:
@@ -275,7 +298,7 @@ class Search:
             if self.region is not None:
                 frames["template"] = self._aligned(scale, turn)
             for frame, shift in frames.items():
-                cost = misfit(self.poses[pose], points + shift)[0] + _turned(turn)
+                cost = self._misfit(scale, turn, pose, shift) + _turned(turn)
                 cost += self._outside(points + shift)
                 coarse.append((cost, unit, scale, turn, pose, shift, frame))
         coarse.sort(key=lambda c: c[0])
@@ -291,7 +314,7 @@ class Search:
         for (unit, scale), turn, pose in itertools.product(units.items(), turned, _POSES):
             points = self.coarse @ turn.matrix.T * scale
             for shift in self._grid(scale, turn, grid):
-                cost = misfit(self.poses[pose], points + shift)[0] + _turned(turn)
+                cost = self._misfit(scale, turn, pose, shift) + _turned(turn)
                 cost += self._outside(points + shift)
                 coarse.append((cost, unit, scale, turn, pose, shift))
         coarse.sort(key=lambda c: c[0])
@@ -299,8 +322,7 @@ class Search:
         for _, unit, scale, turn, pose, shift in _distinct(coarse):
             # Arms or legs may be between those of the poses so far.
             names = self.poses if pose == _POSES[1] else ("rest",)
-            points = self.coarse @ turn.matrix.T * scale + shift
-            cost = {n: misfit(self.poses[n], points)[0] for n in names}
+            cost = {n: self._misfit(scale, turn, n, shift) for n in names}
             for name in sorted(cost, key=cost.__getitem__)[:2]:
                 refined = self._refine(scale, turn, name, shift)
                 best.append(self.judge(unit, scale, turn, name, refined, "found"))
@@ -309,7 +331,8 @@ class Search:
     def _aligned(self, scale: float, turn: Turn) -> np.ndarray:
         """Shift that aligns the bounding box with the template's, at the top."""
         assert self.region is not None
-        x = self.vertices @ turn.matrix.T * scale
+        # Axes change places and signs, so that corners stay corners.
+        x = self.box @ turn.matrix.T * scale
         held = np.where([False, True, False], x.max(axis=0), 0.5 * (x.min(axis=0) + x.max(axis=0)))
         low, high = self.region
         return np.where([False, True, False], high, 0.5 * (low + high)) - held
@@ -325,7 +348,7 @@ class Search:
 
     def _grid(self, scale: float, turn: Turn, step: float) -> list[np.ndarray]:
         """Shifts that put a mesh on the body's axis, at every height."""
-        x = self.vertices @ turn.matrix.T * scale
+        x = self.box @ turn.matrix.T * scale
         low, high = x.min(axis=0), x.max(axis=0)
         middle = 0.5 * (low + high)
         heights = np.arange(self.floor - 0.1 - low[1], 0.8 - high[1] + 1e-9, step)
