@@ -14,10 +14,11 @@ from physxnet_jax.garment import (
     align_to_template,
     load_garment,
     load_outfit,
+    most_alike,
     tailor,
     template,
 )
-from physxnet_jax.garment._locate import NO_HINTS, locate_on_body
+from physxnet_jax.garment._locate import NO_HINTS, _smooth_far, locate_on_body
 from physxnet_jax.garment._openings import openings
 from physxnet_jax.garment._poses import POSES, posed_bodies
 from physxnet_jax.garment._search import UNITS, plausible_units, turns
@@ -126,6 +127,38 @@ def test_shorts_aligned_with_trousers_stay_short(wardrobe):
     height = np.ptp(np.asarray(garment.mesh.vertices)[:, 1])
     assert np.ptp(found.vertices[:, 1]) == pytest.approx(height, rel=1e-3)
     assert found.vertices[:, 1].max() == pytest.approx(0.1, abs=0.06)
+
+
+@pytest.mark.release
+def test_the_most_alike_template_is_the_one_with_the_best_place(wardrobe):
+    """Found once for all templates, it is what each search for itself finds."""
+    garment = wardrobe["shorts"]
+    x = 100 * (np.asarray(garment.mesh.vertices, float) + [0.0, 0.4, 0.1])
+    mesh = still(x, garment.mesh.faces)
+    templates = [template(t) for t in ("top", "bottom", "dress")]
+    name, placed, described = most_alike(mesh, templates, load_body())
+    each = {t.template: align_to_template(mesh, t, load_body()) for t in templates}
+    costs = {t: cost for t, (_, _, cost) in each.items()}
+    assert costs[name] == min(costs.values()) < max(costs.values())
+    np.testing.assert_array_equal(placed.vertices, each[name][0].vertices)
+    assert described == each[name][1]
+
+
+def test_where_the_skin_is_far_weights_are_smoothed_and_nowhere_else():
+    rng = np.random.default_rng(0)
+    k = np.arange(30)
+    faces = np.stack([k, k + 1, (k + 2)], axis=1)
+    weights = np.zeros((32, 6), np.float32)
+    weights[:, [1, 4]] = rng.dirichlet([1.0, 1.0], 32)
+    distance = np.where(np.arange(32) < 16, 0.0, 0.1)
+    found = _smooth_far(weights, faces, distance)
+    np.testing.assert_allclose(found[:16], weights[:16], atol=1e-6)
+    np.testing.assert_allclose(found.sum(axis=1), 1.0, atol=1e-12)
+    assert not found[:, [0, 2, 3, 5]].any(), "joints that nothing hangs on"
+    rough = [np.abs(np.diff(w[16:, 1])).max() for w in (weights, found)]
+    assert rough[1] < 0.2 * rough[0]
+    # The control: near the skin everywhere, nothing changes.
+    np.testing.assert_allclose(_smooth_far(weights, faces, 0.0 * distance), weights, atol=1e-6)
 
 
 def cape():
@@ -250,7 +283,8 @@ def test_turns_are_rotations_that_put_the_axes_up_and_forward():
     np.testing.assert_allclose(turn.matrix @ [1, 0, 0], [0, 0, 1], atol=1e-12)
 
 
-def test_limbs_pass_through_rings_about_them():
+@pytest.mark.parametrize("count", [20, 2000])
+def test_limbs_pass_through_rings_about_them(count):
     """A ring about a limb's line, and one beside it."""
     bodies = posed_bodies(load_body())
     assert set(bodies) == set(POSES)
@@ -260,9 +294,9 @@ def test_limbs_pass_through_rings_about_them():
             along = along / np.linalg.norm(along)
             side = np.cross(along, [0.3, 0.2, 0.9])
             side /= np.linalg.norm(side)
-            angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)[:, None]
+            angle = np.linspace(0, 2 * np.pi, count, endpoint=False)[:, None]
             ring = 0.06 * (np.cos(angle) * side + np.sin(angle) * np.cross(along, side))
-            loops = [np.arange(20, dtype=np.int32)]
+            loops = [np.arange(count, dtype=np.int32)]
             (around,) = openings(middle + ring, loops, posed.limbs)
             assert around.limbs == (limb,)
             (beside,) = openings(middle + ring + 0.5 * side, loops, posed.limbs)
