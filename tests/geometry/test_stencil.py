@@ -41,6 +41,31 @@ def test_nearby_disconnected_sheet_is_excluded():
     np.testing.assert_allclose(np.asarray(s @ values), np.asarray(values), atol=1e-6)
 
 
+def test_of_fine_meshes_a_few_vertices_are_sampled():
+    """As near to the Gaussian mean, and no mixing of sheets that lie upon each other."""
+    v, f = sheet(72, 0.002)
+    both = np.concatenate([v, v + [0.0, 0.0, 0.001], [[5.0, 5.0, 5.0]]])
+    s = gaussian_stencil(both, np.concatenate([f, f + len(v)]), 0.03)
+    assert len(np.unique(np.asarray(s.index)[:-1])) < len(both) / 8
+    np.testing.assert_allclose(np.asarray(s @ jnp.ones((len(both), 1))), 1.0, atol=1e-6)
+    sides = jnp.concatenate([jnp.zeros((len(v), 1)), jnp.ones((len(v) + 1, 1))])
+    np.testing.assert_allclose(np.asarray(s @ sides), np.asarray(sides), atol=1e-6)
+    # The control: a coarse mesh of so many vertices samples them all.
+    wide = gaussian_stencil(*sheet(95, 0.02), 0.03)
+    assert len(np.unique(np.asarray(wide.index))) == 95**2
+    wave = np.sin(20.0 * both[:, 0])
+    middle = np.flatnonzero(np.abs(both[:, :2] - 0.071).max(axis=1) < 0.02)
+    # Paths go along the grid, and along one diagonal of its squares.
+    gap = both[middle][:, None] - both[None]
+    x, y = np.abs(gap[..., 0]), np.abs(gap[..., 1])
+    cut = np.maximum(x, y) + (np.sqrt(2.0) - 1.0) * np.minimum(x, y)
+    far = np.where(gap[..., 0] * gap[..., 1] < 0, cut, x + y)
+    weight = np.exp(-0.5 * (far / 0.03) ** 2) * (far < 0.066) * (np.abs(gap[..., 2]) < 5e-4)
+    exact = weight @ wave / weight.sum(axis=1)
+    found = np.asarray(s @ jnp.asarray(wave[:, None], jnp.float32))[middle, 0]
+    assert np.sqrt(np.mean((found - exact) ** 2)) < 0.1 < np.abs(wave[middle] - exact).max()
+
+
 def test_isolated_vertices_keep_values_and_coincident_ones_share_them():
     v = np.zeros((4, 3))
     s = gaussian_stencil(v, np.array([[0, 1, 2]]), 0.01)

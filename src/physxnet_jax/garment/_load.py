@@ -133,7 +133,12 @@ def load_garment(
     item = parse_wear(path)
     if item.name in KINDS:
         return _tailored(item, shape)
-    garment, report = _load(item, body)
+    return _of_fabric(item, *_load(item, body))
+
+
+def _of_fabric(
+    item: WearItem, garment: Garment, report: GarmentReport
+) -> tuple[Garment, GarmentReport]:
     return garment if item.fabric is None else with_fabric(garment, item.fabric), report
 
 
@@ -166,7 +171,7 @@ def load_outfit(
         return [load_garment(path, body=body, shape=shape)]
     raw = read_mesh(file)
     if len(raw.parts) < 2:
-        return [load_garment(path, body=body, shape=shape)]
+        return [_of_fabric(item, *_load(item, body, raw))]
     placement = place_mesh(item, raw, body)
     groups = _garments(file, raw, placement, body)
     out = []
@@ -174,8 +179,7 @@ def load_outfit(
         name = item.name if names is None else f"{item.name}#{'+'.join(names)}"
         mesh = raw if names is None else read_mesh(name)
         there = placement if names is None else _part(raw, placement, mesh, body)
-        garment, report = garment_of(name, mesh, there, None, body)
-        out.append((garment if item.fabric is None else with_fabric(garment, item.fabric), report))
+        out.append(_of_fabric(item, *garment_of(name, mesh, there, None, body)))
     return out
 
 
@@ -246,7 +250,9 @@ def _read(item: WearItem) -> StaticMesh:
     return read_mesh(path)
 
 
-def _load(item: WearItem, body: Body) -> tuple[Garment, GarmentReport]:
+def _load(
+    item: WearItem, body: Body, raw: StaticMesh | None = None
+) -> tuple[Garment, GarmentReport]:
     path, kind = item.name, item.template
     if str(path) in TEMPLATES:
         if kind is not None:
@@ -258,7 +264,7 @@ def _load(item: WearItem, body: Body) -> tuple[Garment, GarmentReport]:
         near = distance < NEAREST
         report = _report(str(path), "m", "Y", v, faces, near, distance, g.template)
         return g, report
-    raw = _read(item)
+    raw = _read(item) if raw is None else raw
     placement = place_mesh(item, raw, body)
     return garment_of(path, raw, placement, kind, body)
 

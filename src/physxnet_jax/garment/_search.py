@@ -199,7 +199,7 @@ class Search:
         faces: Int[np.ndarray, "faces 3"],
         poses: dict[str, PosedBody],
     ) -> None:
-        self.region: tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]] | None = None
+        self.region: tuple[Float[np.ndarray, 3], Float[np.ndarray, 3]] | None = None
         self.costs: dict[tuple[str, str, int, float, bytes], float] = {}
         self.vertices, self.poses = drawn_in(np.asarray(vertices, np.float64)), poses
         self.coarse = surface_points(self.vertices, faces, _COARSE)

@@ -1,19 +1,24 @@
 """Averages over neighbourhoods of a mesh."""
 
 import dataclasses
+from collections.abc import Iterator
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
-from scipy.sparse.csgraph import dijkstra
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import KDTree
 
 from ..typing import pytree
+from ._candidates import spread_points
 from ._topology import mesh_edges
 
 # Rows of the distance matrix computed at once.
 _CHUNK = 512
+# Meshes of more vertices are looked at for being fine, and are if a radius has so many more.
+_FINE, _FINER = 8192, 8
 # Maximum number of finer stencils after one with more rows in reach than it takes.
 _MAX_FINER_STENCILS = 3
 
@@ -61,7 +66,8 @@ def gaussian_stencil(
         faces: Triangles.
         radius: Standard deviation [m]; vertices within 2.2 radii contribute.
         size: Number of vertices. If more are within reach, they are sampled evenly in
-            order of distance; applying the stencil twice compensates for that.
+            order of distance; applying the stencil twice compensates for that. Of a mesh much
+            finer than the radius, only vertices half a radius apart are sampled.
 
     Returns:
         The stencil; unconnected vertices keep their own value.
@@ -71,20 +77,63 @@ def gaussian_stencil(
     # The sparse graph treats an edge of length zero as absent.
     length = np.maximum(np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1), 1e-9)
     graph = sp.csr_matrix((length, (edges[:, 0], edges[:, 1])), (count, count))
+    graph = (graph + graph.T).tocsr()
     index = np.repeat(np.arange(count, dtype=np.int32)[:, None], size, axis=1)
     weight = np.zeros((count, size))
-    for start in range(0, count, _CHUNK):
-        rows = np.arange(start, min(start + _CHUNK, count))
-        far = dijkstra(graph, directed=False, indices=rows, limit=2.2 * radius)
-        for row, d in zip(rows, far, strict=True):
-            near = np.flatnonzero(np.isfinite(d))
-            near = near[np.argsort(d[near], kind="stable")]
-            if len(near) > size:
-                near = near[np.linspace(0, len(near) - 1, size).astype(int)]
-            index[row, : len(near)] = near
-            weight[row, : len(near)] = np.exp(-0.5 * (d[near] / radius) ** 2)
+    sites = np.arange(count)
+    if count > _FINE:
+        # Each part has sites of its own, however near others lie.
+        part = connected_components(graph, directed=False)[1]
+        aside = part[:, None] * [np.ptp(vertices[:, 0]) + radius, 0.0, 0.0]
+        some = np.sort(spread_points(vertices + aside, 0.5 * radius))
+        sites = some if count > _FINER * len(some) else sites
+    if len(sites) == count:
+        for rows, box, far in _reached(graph, vertices, sites, 2.2 * radius):
+            for row, d in zip(rows, far, strict=True):
+                near = np.flatnonzero(np.isfinite(d))
+                near = near[np.argsort(d[near], kind="stable")]
+                if len(near) > size:
+                    near = near[np.linspace(0, len(near) - 1, size).astype(int)]
+                index[row, : len(near)] = box[near]
+                weight[row, : len(near)] = np.exp(-0.5 * (d[near] / radius) ** 2)
+    else:
+        found = []
+        for rows, box, far in _reached(graph, vertices, sites, 2.2 * radius):
+            site, row = np.nonzero(np.isfinite(far))
+            found.append((box[row], rows[site], far[site, row]))
+        row, site, distance = (np.concatenate(x) for x in zip(*found, strict=True))
+        order = np.lexsort((site, distance, row))
+        row, site, distance = row[order], site[order], distance[order]
+        first, number = np.searchsorted(row, np.arange(count)), np.bincount(row, minlength=count)
+        for k in range(size):
+            # All of few, and of many as many, from the nearest to the farthest.
+            at = np.where(number > size, k * (number - 1) // (size - 1), k)
+            on = np.flatnonzero(at < number)
+            pick = first[on] + at[on]
+            index[on, k] = site[pick]
+            weight[on, k] = np.exp(-0.5 * (distance[pick] / radius) ** 2)
     weight /= weight.sum(axis=1, keepdims=True)
     return Stencil(jax.device_put(index), jax.device_put(weight.astype(np.float32)))
+
+
+def _reached(
+    graph: sp.csr_matrix,
+    vertices: Float[np.ndarray, "vertices 3"],
+    sources: Int[np.ndarray, " sources"],
+    reach: float,
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Distances along edges within a reach [m]: sources, vertices, and a row for each source.
+
+    Sources that lie beside each other come together: their paths stay within the box around them,
+    so that the distances to all other vertices needn't be held.
+    """
+    order = KDTree(vertices[sources], leafsize=_CHUNK).indices
+    for start in range(0, len(order), _CHUNK):
+        rows = np.sort(sources[order[start : start + _CHUNK]])
+        low, high = vertices[rows].min(axis=0) - reach, vertices[rows].max(axis=0) + reach
+        box = np.flatnonzero(((vertices >= low) & (vertices <= high)).all(axis=1))
+        at = np.searchsorted(box, rows)
+        yield rows, box, dijkstra(graph[box][:, box], directed=False, indices=at, limit=reach)
 
 
 @pytree
