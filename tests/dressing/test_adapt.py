@@ -87,6 +87,12 @@ def test_simulations_lower_the_distance_from_the_simulation():
     assert worn.predictor is not None
 
 
+@pytest.mark.release
+def test_motions_that_are_too_short_are_refused():
+    with pytest.raises(MotionError, match="walk is shorter than a window"):
+        adapt("bottom", weights="nano", motions=[load_motion("walk", fps=30.0)[:5]])
+
+
 def test_what_cannot_be_adapted_is_refused():
     with pytest.raises(ValueError, match="frames is 2"):
         AdaptConfig(frames=2)
@@ -96,8 +102,6 @@ def test_what_cannot_be_adapted_is_refused():
         AdaptConfig(potential=-1.0)
     with pytest.raises(MotionError, match="shorter than a window"):
         adapt("bottom", weights="nano", frames=5)
-    with pytest.raises(MotionError, match="shorter than a window"):
-        adapt("bottom", weights="nano", motions=[load_motion("walk", fps=30.0)[:5]])
     nano = load_predictor("nano")
     with pytest.raises(WeightsError, match="as it was loaded"):
         adapt("bottom", weights=dataclasses.replace(nano, mirror_tta=True))
