@@ -318,7 +318,7 @@ def test_motions_are_simulated_at_the_requested_rate():
         ('motion = "walk"\n[shape]\nself = 1', "Unknown shape parameter"),
         ('motion = "walk"\naccuracy = "best"', "draft, standard, fine"),
         ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = "tin"', "cotton"),
-        ('motion = "walk"\n[[garments]]\nname = "top"', "file and fabric"),
+        ('motion = "walk"\n[[garments]]\nname = "top"', "file, fabric and pin, not name"),
         ('motion = "walk"\nup = "x"', "up is y or z"),
         ('motion = "walk"\nstandard = 1', "standard can't be 1"),
         ('motion = "walk"\n[[garments]]\nfile = "top"\nfabric = {hue = 1}', "no 'hue'"),

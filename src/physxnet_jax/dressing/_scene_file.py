@@ -355,7 +355,8 @@ def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, Any]
         keys = set(g) if isinstance(g, dict) else {str(g)}
         if keys - set(GARMENT_KEYS) or not isinstance(g.get("file", ""), str):
             raise FormatError(
-                f"{path}: a garment takes {', '.join(GARMENT_KEYS)}, not {', '.join(keys)}."
+                f"{path}: a garment takes {', '.join(GARMENT_KEYS[:-1])} and {GARMENT_KEYS[-1]}, not"
+                f" {', '.join(sorted(keys - set(GARMENT_KEYS)) or sorted(keys))}."
             )
         pins = g.get("pin", [])
         if not isinstance(pins, list) or not all(type(n) is int and 0 <= n < 2**31 for n in pins):
