@@ -353,11 +353,11 @@ def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, Any]
     ]
     for g in words:
         keys = set(g) if isinstance(g, dict) else {str(g)}
-        if keys - set(GARMENT_KEYS) or not isinstance(g.get("file", ""), str):
-            raise FormatError(
-                f"{path}: a garment takes {', '.join(GARMENT_KEYS[:-1])} and {GARMENT_KEYS[-1]}, not"
-                f" {', '.join(sorted(keys - set(GARMENT_KEYS)) or sorted(keys))}."
-            )
+        unknown = sorted(keys - set(GARMENT_KEYS))
+        if unknown or not isinstance(g.get("file", ""), str):
+            known = f"{', '.join(GARMENT_KEYS[:-1])} and {GARMENT_KEYS[-1]}"
+            wrong = ", ".join(unknown or sorted(keys))
+            raise FormatError(f"{path}: a garment takes {known}, not {wrong}.")
         pins = g.get("pin", [])
         if not isinstance(pins, list) or not all(type(n) is int and 0 <= n < 2**31 for n in pins):
             raise FormatError(f"{path}: pin is a list of vertex numbers, the first of which is 0.")
