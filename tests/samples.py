@@ -175,3 +175,12 @@ def rigged_person(path, body, shape=None, *, unit=0.01, family="vrm"):
     g.set_binary_blob(bytes(blob))
     g.save_binary(str(path))
     return path
+
+
+def sheet(n, step=0.01):
+    """Vertices [m] and triangles of a flat square of n x n vertices."""
+    y, x = np.mgrid[:n, :n] * step
+    v = np.column_stack([x.ravel(), y.ravel(), np.zeros(n * n)])
+    i = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (q.ravel() for q in (i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]))
+    return v, np.concatenate([np.column_stack([a, b, c]), np.column_stack([b, d, c])])

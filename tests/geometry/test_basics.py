@@ -49,6 +49,16 @@ def test_axis_angle_is_smooth_at_zero():
     np.testing.assert_allclose(np.asarray(jacobian), expected, atol=1e-7)
 
 
+def test_polar_rotation_matches_products_of_matrices():
+    """The iteration entry by entry is that with products of matrices."""
+    rng = np.random.default_rng(0)
+    x = np.eye(3) + 0.3 * rng.normal(size=(50, 3, 3))
+    ours = np.asarray(polar_rotation(jnp.asarray(x, jnp.float32)))
+    for _ in range(6):
+        x = 1.5 * x - 0.5 * x @ np.swapaxes(x, 1, 2) @ x
+    np.testing.assert_allclose(ours, x, atol=2e-5)
+
+
 def test_polar_rotation_is_the_nearest_one_and_finite_when_singular():
     rng = np.random.default_rng(0)
     blends = 0.6 * Rotation.random(20, rng).as_matrix()

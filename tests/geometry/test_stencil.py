@@ -1,18 +1,15 @@
 """Means over neighbourhoods: what they keep, and where they stop."""
 
+import pathlib
+import runpy
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from physxnet_jax.geometry import Stencil, gaussian_smoothing, gaussian_stencil, spread_points
 
-
-def sheet(n, step=0.01):
-    y, x = np.mgrid[:n, :n] * step
-    v = np.column_stack([x.ravel(), y.ravel(), np.zeros(n * n)])
-    i = np.arange(n * n).reshape(n, n)
-    a, b, c, d = (q.ravel() for q in (i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]))
-    return v, np.concatenate([np.column_stack([a, b, c]), np.column_stack([b, d, c])])
+sheet = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "samples.py"))["sheet"]
 
 
 def test_stencil_keeps_constants_and_reduces_noise():

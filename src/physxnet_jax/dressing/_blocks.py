@@ -63,15 +63,15 @@ class Block:
 
     Attributes:
         start: Index of the first frame.
-        raw: Each garment by name before collision resolution [m], shape
-            [frames, vertices, 3].
+        raw: Each garment by name before collision resolution [m], fine meshes at their sites,
+            shape [frames, vertices, 3].
         positions: Each garment by name [m], shape [frames, vertices, 3].
         milliseconds: Time of the whole block, transfers included [ms]; NaN if an earlier run
             computed it.
     """
 
     start: int
-    raw: dict[str, Float[np.ndarray, "frames vertices 3"]]
+    raw: dict[str, Float[np.ndarray, "frames _ 3"]]
     positions: dict[str, Float[np.ndarray, "frames vertices 3"]]
     milliseconds: float
 

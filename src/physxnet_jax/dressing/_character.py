@@ -30,7 +30,13 @@ from ..motion import (
 from ._blocks import PosedClip, resolve_clip_layers
 from ._character_file import RigClip, read_character
 from ._dresser import Dresser
-from .postprocess import BodyCollider, faces_at_rest, resolve_collisions_with_skin
+from .postprocess import (
+    BodyCollider,
+    carry_clip,
+    clip_at_sites,
+    faces_at_rest,
+    resolve_collisions_with_skin,
+)
 
 # Skin vertices whose residuals a garment vertex averages, and the width of their weights [m].
 _NUM_NEAREST, _WEIGHT_WIDTH = 24, 0.03
@@ -386,12 +392,15 @@ def dress_character(
     if dresser.colliders is None:
         return raw, raw
     world, shift = clip.rotations, clip.translations
+    sites = dict(zip(raw, dresser.sites, strict=True))
+    coarse = {n: clip_at_sites(s, raw[n]) for n, s in sites.items()}
     out = {
-        w.name: resolve_character_collisions(c, w, character, raw[w.name], world, shift)
+        w.name: resolve_character_collisions(c, w, character, coarse[w.name], world, shift)
         for c, w in zip(dresser.colliders, dresser.worn, strict=True)
     }
     # Resolving collisions with the skin may move a garment through the one over it.
-    return raw, resolve_clip_layers(dresser.layers or (), out)
+    out = resolve_clip_layers(dresser.layers or (), out)
+    return raw, {n: carry_clip(s, raw[n], out[n]) for n, s in sites.items()}
 
 
 def resolve_character_collisions(

@@ -351,6 +351,8 @@ def clothe_step(
         cloth = limit(dresser, cloth, r[None], t[None])
         cloth = resolve(dresser, cloth, r[None], t[None])
         one = tuple(x[0] for x in cloth)
+    whole = dresser.expand(tuple(x[None] for x in one), r[None], t[None])
+    one = tuple(x[0] for x in whole)
     return stream, _make_clothed(dresser, one, well, stream.place)
 
 

@@ -35,7 +35,7 @@ from ._inference import Inference
 from ._meshes import Wear, animated_meshes, resolve_garments
 from ._simulate import EXTERNAL_ENGINES, Simulation, build_scene, run_simulation, with_floor
 from ._stages import Stage, timed
-from .postprocess import BodyCollider, make_colliders, prepare_layers
+from .postprocess import BodyCollider, clip_at_sites, make_colliders, prepare_layers
 
 Method = Literal["network", "guided", "lbs", "simulate"]
 METHODS: tuple[Method, ...] = ("network", "guided", "lbs", "simulate")
@@ -354,8 +354,10 @@ def _infer_cloth(
             if progress is not None:
                 progress(name, min(block.start + BLOCK, clip.num_frames), clip.num_frames)
             begun = time.perf_counter()
-            for n, c in zip(names, colliders.result(), strict=False):
-                after = before = inside_shares(c, block.positions[n], clip, block.start)
+            for n, s, c in zip(names, dresser.sites, colliders.result(), strict=False):
+                after = before = inside_shares(
+                    c, clip_at_sites(s, block.positions[n]), clip, block.start
+                )
                 if dresser.colliders is not None:
                     before = inside_shares(c, block.raw[n], clip, block.start)
                 inside[n].append((before, after))
@@ -403,11 +405,11 @@ def _measured(
     """Simulated cloth with its shares inside the body; a character is measured differently."""
     begun = time.perf_counter()
     inside = {}
-    for w, c in zip(dresser.worn, colliders, strict=False):
+    for w, s, c in zip(dresser.worn, dresser.sites, colliders, strict=False):
         shares: list[np.ndarray] = []
         start = 0
         for x in in_chunks(cloth.positions[w.name]):
-            shares.append(inside_shares(c, x, person.clip, start))
+            shares.append(inside_shares(c, clip_at_sites(s, x), person.clip, start))
             start += len(x)
         inside[w.name] = (np.concatenate(shares),) * 2
     elapsed = 1e3 * (time.perf_counter() - begun)

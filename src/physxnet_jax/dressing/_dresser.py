@@ -1,6 +1,8 @@
 """The dresser: all state of inference, loaded and bound once."""
 
 import dataclasses
+import functools
+from collections.abc import Sequence
 from typing import Literal
 
 from jaxtyping import Array, Float, Int
@@ -9,6 +11,7 @@ from ..body import Body, load_body
 from ..devices import prepared_on_processor, side_by_side
 from ..errors import PhysXNetError, WeightsError
 from ..garment import Garment, SkinnedGarment, make_skinned
+from ..geometry import map_frames
 from ..models import (
     BoundGarment,
     Predictor,
@@ -26,9 +29,13 @@ from ._meshes import Wear, resolve_garments
 from ._simulate import Simulation
 from .postprocess import (
     BodyCollider,
+    Cloth,
     Layer,
     Outfit,
+    Sites,
     StrainLimits,
+    garment_at_sites,
+    make_sites,
     prepare_collisions,
     prepare_layers,
     prepare_strain,
@@ -47,11 +54,14 @@ class Dresser:
         body: The body.
         rest: Its rest vertices [m], shape [all, 3].
         predictor: The network with batch norm folded; None for skinning alone.
-        worn: Garments on the body shape, bound to the predictor's atlas if there is one.
+        worn: Garments on the body shape, bound to the predictor's atlas if there is one; those of
+            fine meshes at their sites.
         strain: Strain limits; None if they aren't requested.
         colliders: The skin near each garment; None if collisions aren't resolved.
         layers: Pairs of garments whose order is enforced; None if collisions aren't resolved.
         garments: The garments on the default shape, with their meshes.
+        sites: For each garment with a fine mesh, the vertices at which cloth is computed; None for
+            others.
         guided: What simulates the garments, drawn to the prediction; None if it is the result.
         notes: Remarks on garment files. They aren't part of the pytree: a dresser that a
             transformed function returns has none.
@@ -65,6 +75,7 @@ class Dresser:
     colliders: tuple[BodyCollider, ...] | None
     layers: tuple[Layer, ...] | None
     garments: tuple[Garment, ...]
+    sites: tuple[Sites | None, ...]
     guided: GuidedScene | None = None
     notes: tuple[str, ...] = dataclasses.field(default=(), metadata={"drop": True})
 
@@ -85,8 +96,27 @@ class Dresser:
 
     @property
     def outfit(self) -> Outfit:
-        """The input from which post-processing steps are prepared."""
-        return Outfit(self.body, self.rest, self.worn, self.garments)
+        """The input from which post-processing steps are prepared: fine meshes at their sites."""
+        return Outfit(self.body, self.rest, self.worn, _at_sites(self.sites, self.garments))
+
+    def expand(
+        self,
+        cloth: Cloth,
+        rotations: Float[Array, "frames joints 3 3"],
+        translations: Float[Array, "frames joints 3"],
+    ) -> Cloth:
+        """Fine meshes with all their vertices [m], see `Sites.expand`; others are unchanged."""
+        every = zip(self.sites, self.worn, cloth, strict=True)
+        return tuple(
+            x
+            if s is None
+            else map_frames(functools.partial(s.expand, w), x, rotations, translations)
+            for s, w, x in every
+        )
+
+
+def _at_sites(sites: tuple[Sites | None, ...], garments: Sequence[Garment]) -> tuple[Garment, ...]:
+    return tuple(garment_at_sites(s, g) for s, g in zip(sites, garments, strict=True))
 
 
 @prepared_on_processor
@@ -153,10 +183,12 @@ def dress_garments(
     """`make_dresser` for garments that are already on the body."""
     inference = Inference() if inference is None else inference
     rest = body.rest_vertices(body.checked_shape(shape))
+    sites = tuple(make_sites(g, rest) for g in garments)
+    coarse = _at_sites(sites, garments)
     if method == "lbs":
         predictor = None
         inference = dataclasses.replace(inference, strain_iterations=0)
-        worn = tuple(make_skinned(g, rest) for g in garments)
+        worn = tuple(make_skinned(g, rest) for g in coarse)
     else:
         predictor = with_body(_predictor(inference), body, rest)
         predictor = at_precision(predictor, precision)
@@ -165,8 +197,8 @@ def dress_garments(
         def bound(g: Garment) -> BoundGarment:
             return bind_to_predictor(own, body, rest, g)
 
-        worn = tuple(side_by_side(bound, garments))
-    outfit, guided = Outfit(body, rest, worn, tuple(garments)), None
+        worn = tuple(side_by_side(bound, coarse))
+    outfit, guided = Outfit(body, rest, worn, coarse), None
     if method == "guided":
         # The simulation has strain, contact and layers of its own.
         inference = dataclasses.replace(inference, strain_iterations=0, collisions=False)
@@ -181,6 +213,7 @@ def dress_garments(
         colliders=prepare_collisions(outfit, inference),
         layers=prepare_layers(outfit, inference),
         garments=tuple(garments),
+        sites=sites,
         guided=guided,
         notes=notes,
     )

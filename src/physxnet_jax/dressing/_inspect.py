@@ -42,8 +42,8 @@ _INSIDE, _FINE, _MAX_MISSED = 0.02, 0.003, 0.1
 # Cloth is over skin up to this distance, and this much aside of the normal [m]; share of the skin
 # that something worn covers, and share of visible skin worth reporting [1]; size of the pictures.
 _OVER, _ASIDE, _BARE, _SHOWS, _PIXELS = 0.15, 0.02, 0.005, 0.01, 256
-# Smallest extent of a garment [m]; largest numbers of a file's meshes and faces to examine.
-_MIN_EXTENT, _MAX_PARTS, _MOST_FACES = 0.25, 20, 5000
+# Smallest extent of a garment [m]; largest numbers of meshes, faces and vertices to examine.
+_MIN_EXTENT, _MAX_PARTS, _MOST_FACES, _MOST_VERTICES = 0.25, 20, 5000, 10_000
 # A better placement has to bring a garment nearer to the skin by this factor; below this hit
 # rate, a garment far from the skin may be misplaced [1].
 _DISTANCE_RATIO, _MIN_HIT_RATE = 0.85, 0.5
@@ -379,7 +379,9 @@ def _better_placement(
 ) -> tuple[Template, str] | None:
     """A template whose place a garment fits better than its own, and how; None if there is none."""
     name, placed, description = most_alike(raw, [template(t) for t in TEMPLATES], body)
-    there, _ = clearance(body.rest_mesh(), np.asarray(placed.vertices, np.float32))
+    some = np.unique(np.linspace(0, len(distance) - 1, _MOST_VERTICES).astype(int))
+    distance = distance[some]
+    there, _ = clearance(body.rest_mesh(), np.asarray(placed.vertices, np.float32)[some])
     now, then = (float(np.mean(x < NEAREST)) for x in (distance, there))
     nearer = float(np.mean(np.abs(there))) < _DISTANCE_RATIO * float(np.mean(np.abs(distance)))
     better = then <= max(0.7 * now, _INSIDE) if nearer else then <= 0.25 * now and now > ELSEWHERE

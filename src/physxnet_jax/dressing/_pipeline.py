@@ -74,14 +74,15 @@ def infer(
             as predicted.
 
     Returns:
-        Garments before collision resolution, the result [m], and simulated cloth in the last frame.
+        Garments before collision resolution (fine meshes at their sites), the result [m], and
+        simulated cloth in the last frame.
     """
     first = dresser.history_length(fps)
     r, t = rotations[first:], translations[first:]
     predicted = predict_cloth(dresser, rotations, translations, fps)
     if dresser.guided is None:
         raw = limit(dresser, predicted, r, t)
-        return raw, resolve(dresser, raw, r, t), None
+        return raw, dresser.expand(resolve(dresser, raw, r, t), r, t), None
     scene, worn = dresser.guided, dresser.worn
     if state is None:
         state = init_guided(scene, rotations[first - 1], translations[first - 1])
@@ -90,7 +91,7 @@ def infer(
         return advance_guided(scene, worn, s, *frame, fps)
 
     state, cloth = jax.lax.scan(jax.checkpoint(step), state, (predicted, r, t))
-    return cloth, cloth, state
+    return cloth, dresser.expand(cloth, r, t), state
 
 
 @functools.partial(jax.jit, static_argnames="fps")

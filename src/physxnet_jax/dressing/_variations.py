@@ -71,15 +71,15 @@ def with_cut(dresser: Dresser, cut: Mapping[str, Float[Array, "vertices 3"]]) ->
         >>> bool((with_cut(person, {"shorts": wide}).worn[0].rest == wide).all())
         True
     """
-    known = {w.name: w for w in dresser.worn}
+    known = dict(zip([w.name for w in dresser.worn], _whole(dresser), strict=True))
     for name, vertices in cut.items():
         if name not in known:
             raise PhysXNetError(f"No garment '{name}' is worn, only {', '.join(known)}.")
-        if vertices.shape != known[name].rest.shape:
+        if vertices.shape != known[name].shape:
             raise PhysXNetError(
-                f"{name}: {len(vertices)} vertices for a mesh of {len(known[name].rest)}."
+                f"{name}: {len(vertices)} vertices for a mesh of {len(known[name])}."
             )
-    cloth = tuple(cut.get(w.name, w.rest) for w in dresser.worn)
+    cloth = tuple(cut.get(n, x) for n, x in known.items())
     return _varied(dresser, dresser.rest, cloth)
 
 
@@ -102,13 +102,21 @@ def with_fabric(dresser: Dresser, **factors: Float[Array, ""] | float) -> Dresse
     return dataclasses.replace(dresser, guided=dresser.guided.with_system(system))
 
 
+def _whole(dresser: Dresser) -> tuple[Float[Array, "_ 3"], ...]:
+    """Rest vertices of each garment, of fine meshes all [m]."""
+    pairs = zip(dresser.sites, dresser.worn, strict=True)
+    return tuple(w.rest if s is None else s.whole.rest for s, w in pairs)
+
+
 def _varied(
     dresser: Dresser, rest: Float[Array, "all 3"], cloth: tuple[Float[Array, "_ 3"], ...]
 ) -> Dresser:
-    """The dresser with other rest vertices of the body and of each garment."""
-    predictor = dresser.predictor
+    """The dresser with other rest vertices of the body and of each whole garment."""
+    predictor, pairs = dresser.predictor, list(zip(dresser.sites, cloth, strict=True))
+    sites = tuple(s and s.at_rest(x) for s, x in pairs)
+    chosen = (x if s is None else x[s.rows] for s, x in pairs)
     worn: tuple[SkinnedGarment, ...] = tuple(
-        dataclasses.replace(w, rest=x) for w, x in zip(dresser.worn, cloth, strict=True)
+        dataclasses.replace(w, rest=x) for w, x in zip(dresser.worn, chosen, strict=True)
     )
     if predictor is not None:
         skirts = any(w.template == "dress" for w in worn)
@@ -129,6 +137,7 @@ def _varied(
         rest=rest,
         predictor=predictor,
         worn=worn,
+        sites=sites,
         strain=None if strain is None else reshape_strain(strain, worn),
         colliders=None if colliders is None else reshape_colliders(colliders, dresser.body, rest),
         guided=None if guided is None else reshape_guided(guided, dresser.body, rest, worn),

@@ -13,6 +13,8 @@ from ..geometry import (
     boundary_loops,
     closest_among,
     closest_points,
+    coarse_mesh,
+    linear_weights,
     mesh_edges,
     nearby_faces,
     self_intersections,
@@ -27,6 +29,9 @@ Clearance = tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]
 _ROWS = 2048
 # Hanging cloth farther from the skin than this isn't lifted off it [m].
 _NEAR = 0.03
+# Meshes of more vertices are lifted at about so many of them; the last passes, without smoothing,
+# act on all.
+_FINE, _SITES, _LAST = 16_384, 8_192, 2
 
 
 def clearance(body: TriMesh, points: Float[np.ndarray, "points 3"]) -> Clearance:
@@ -125,8 +130,23 @@ def lift_out(
     low = distance < nearest
     if not low.any():
         return vertices, low
+    if len(vertices) > _FINE:
+        vertices, known = _lifted_at_sites(body, vertices, faces, nearest, iterations, known)
+        iterations = _LAST
+    moved = _lifted(body, vertices, faces, nearest, iterations, known)
+    return np.where((distance < 3 * nearest)[:, None], moved, vertices), low
+
+
+def _lifted(
+    body: TriMesh,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    nearest: float,
+    iterations: int,
+    known: Clearance | None = None,
+) -> Float[np.ndarray, "vertices 3"]:
     count = len(vertices)
-    moved = set_clearance(
+    return set_clearance(
         body,
         vertices,
         faces,
@@ -135,7 +155,27 @@ def lift_out(
         iterations=iterations,
         known=known,
     )
-    return np.where((distance < 3 * nearest)[:, None], moved, vertices), low
+
+
+def _lifted_at_sites(
+    body: TriMesh,
+    vertices: Float[np.ndarray, "vertices 3"],
+    faces: Int[np.ndarray, "faces 3"],
+    nearest: float,
+    iterations: int,
+    known: Clearance,
+) -> tuple[Float[np.ndarray, "vertices 3"], Clearance]:
+    """A fine mesh lifted by what lifts a coarse one, and its clearance there.
+
+    What is 1.5 distances from the skin or more stays.
+    """
+    rows, coarse, label = coarse_mesh(vertices, faces, _SITES)
+    at = vertices[rows]
+    moved = _lifted(body, at, coarse, nearest, iterations, (known[0][rows], known[1][rows]))
+    near, weight = linear_weights(vertices, faces, rows, label)
+    change = np.einsum("vk,vkc->vc", weight, (moved - at)[near])
+    lifted = vertices + np.where((known[0] < 1.5 * nearest)[:, None], change, 0.0)
+    return lifted, clearance(body, lifted)
 
 
 def bridge_hollows(

@@ -14,6 +14,7 @@ from ._closest import (
     nearest_indices as nearest_indices,
     signed_distance as signed_distance,
 )
+from ._coarse import coarse_mesh as coarse_mesh, linear_weights as linear_weights
 from ._edge_constraints import (
     EdgeConstraints as EdgeConstraints,
     limit_strain as limit_strain,

@@ -1,5 +1,6 @@
 """Rotations: unit quaternions (wxyz), matrices, axis-angle. Smooth at the identity."""
 
+from collections.abc import Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 _A = TypeVar("_A", Array, np.ndarray)
+_Entries = tuple[tuple[Array, ...], ...]
 
 # Below this squared angle [rad^2] the series replaces sin(x)/x: the error is under 1e-9.
 _SMALL = 1e-6
@@ -111,13 +113,26 @@ def polar_rotation(
     References:
         Higham, Functions of Matrices (2008), section 8.3.
     """
-    x = matrices
-    for _ in range(steps):
-        gram = jnp.einsum("...ji,...jk->...ik", x, x, precision=jax.lax.Precision.HIGHEST)
-        x = 1.5 * x - 0.5 * jnp.einsum(
-            "...ij,...jk->...ik", x, gram, precision=jax.lax.Precision.HIGHEST
-        )
-    return x
+
+    def step(x: _Entries, _: None) -> tuple[_Entries, None]:
+        columns = list(zip(*x, strict=True))
+        gram = [[_dot(a, b) for b in columns] for a in columns]
+        return tuple(
+            tuple(
+                1.5 * entry - 0.5 * _dot(row, other) for entry, other in zip(row, gram, strict=True)
+            )
+            for row in x
+        ), None
+
+    # Entry by entry: several times as fast as products of small matrices. A loop, because the
+    # compiler would write the steps out as one expression that grows with a power of their number.
+    start = tuple(tuple(matrices[..., i, k] for k in range(3)) for i in range(3))
+    rows, _ = jax.lax.scan(step, start, None, length=steps)
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def slerp(

@@ -17,7 +17,6 @@ from ._features import Family, FeatureConfig, clip_features
 from ._networks import Modulation
 from ._predictor import Predictor, normalise
 
-_EXACT = jax.lax.Precision.HIGHEST
 # Distance along the cloth over which offsets are averaged [m]: texels are wider than the vertex
 # spacing, and a skirt also samples the maps of both legs, whose edges don't meet.
 _SMOOTHING, _SMOOTHING_SKIRT = 0.015, 0.03
@@ -129,8 +128,7 @@ def apply_sampled_offsets(
         points, _ = skin_points(bound.anchor, bound.anchor_weights, rotations, translations)
         return points + sampled
     points, blend = skin_points(bound.rest, bound.skin, rotations, translations)
-    turned = jnp.einsum("vab,vb->va", polar_rotation(blend), sampled, precision=_EXACT)
-    return points + turned
+    return points + jnp.sum(polar_rotation(blend) * sampled[:, None], axis=2)
 
 
 def dress_frames(

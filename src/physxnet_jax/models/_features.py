@@ -15,7 +15,6 @@ Family = Literal["paper", "local"]
 
 # Frames per second at which networks learn.
 _RATE = 30.0
-_EXACT = jax.lax.Precision.HIGHEST
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,11 +157,12 @@ def point_features(
     if inputs.family == "paper":
         return both.reshape(frames, texels, -1)
     frame = polar_rotation(blends)
-    turned = jnp.einsum("fpba,fpkb->fpka", frame, both, precision=_EXACT)
+    # Sums of products: several times as fast as products of small matrices.
+    turned = jnp.sum(frame[:, :, None] * both[..., None], axis=3)
     out = [turned.reshape(frames, texels, -1)]
     if inputs.gravity:
         out.append(-frame[:, :, 1, :])
     if inputs.position:
         away = points[lead:] - jnp.mean(points[lead:], axis=1, keepdims=True)
-        out.append(jnp.einsum("fpba,fpb->fpa", frame, away, precision=_EXACT))
+        out.append(jnp.sum(frame * away[..., None], axis=2))
     return jnp.concatenate(out, axis=2)

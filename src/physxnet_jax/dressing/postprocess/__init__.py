@@ -24,6 +24,13 @@ from ._layers import (
     resolve_layers as resolve_layers,
 )
 from ._outfit import Cloth as Cloth, Outfit as Outfit
+from ._sites import (
+    Sites as Sites,
+    carry_clip as carry_clip,
+    clip_at_sites as clip_at_sites,
+    garment_at_sites as garment_at_sites,
+    make_sites as make_sites,
+)
 from ._strain import (
     StrainLimits as StrainLimits,
     apply_strain as apply_strain,
