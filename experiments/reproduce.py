@@ -111,7 +111,7 @@ ABRUPT = ("strong gesture", "jump", "punch")
 COPIED = (
     *("oracle", "accuracy_cost", "peers", "engines", "training"),
     *("blender_import", "blender_extension", "layers", "adapt", "unseen", "laptop"),
-    *("losses", "guided", "standing", "history", "fine_garments"),
+    *("losses", "guided", "standing", "history", "memory", "fine_garments"),
 )
 DOCUMENTS = (
     *("docs/reproduction.md", "docs/accuracy-cost.md", "docs/garments.md"),
