@@ -31,8 +31,8 @@ def fine(tmp_path_factory):
 
 @pytest.fixture
 def few(monkeypatch):
-    monkeypatch.setattr(_sites, "_FINE", 2_000)
-    monkeypatch.setattr(_sites, "_SITES", 900)
+    monkeypatch.setattr(_sites, "FINE_MESH", 2_000)
+    monkeypatch.setattr(_sites, "NUM_SITES", 900)
 
 
 def test_meshes_of_usual_size_have_no_sites(dresser):
@@ -87,7 +87,7 @@ def test_network_and_guided_cloth_of_fine_meshes_is_near_that_of_all_vertices(fi
     found = {}
     for name in ("sites", "all"):
         if name == "all":
-            monkeypatch.setattr(_sites, "_FINE", 10**9)
+            monkeypatch.setattr(_sites, "FINE_MESH", 10**9)
         for method in ("network", "guided"):
             clip = dress(motion, [str(fine)], method=method, frames=12, include_body=False)
             found[name, method] = np.asarray(clip.garments[0].positions)

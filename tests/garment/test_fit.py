@@ -13,8 +13,8 @@ NEAREST = 0.004
 def test_lifted_garments_clear_the_skin_and_the_rest_stays(fine, monkeypatch):
     """Whether every vertex is moved, or a fine mesh follows a coarse one."""
     if fine:
-        monkeypatch.setattr(_fit, "_FINE", 2_000)
-        monkeypatch.setattr(_fit, "_SITES", 1_000)
+        monkeypatch.setattr(_fit, "FINE_MESH", 2_000)
+        monkeypatch.setattr(_fit, "NUM_SITES", 1_000)
     body = load_body()
     skin, garment = body.rest_mesh(), template("bottom")
     faces, start = np.asarray(garment.mesh.faces), np.array(garment.mesh.vertices)

@@ -9,6 +9,8 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.sparse.linalg import spsolve
 
 from ..geometry import (
+    FINE_MESH,
+    NUM_SITES,
     TriMesh,
     boundary_loops,
     closest_among,
@@ -29,9 +31,8 @@ Clearance = tuple[Float[np.ndarray, " points"], Float[np.ndarray, "points 3"]]
 _ROWS = 2048
 # Hanging cloth farther from the skin than this isn't lifted off it [m].
 _NEAR = 0.03
-# Meshes of more vertices are lifted at about so many of them; the last passes, without smoothing,
-# act on all.
-_FINE, _SITES, _LAST = 16_384, 8_192, 2
+# Fine meshes are lifted at their sites; the last passes, without smoothing, act on all vertices.
+_LAST = 2
 
 
 def clearance(body: TriMesh, points: Float[np.ndarray, "points 3"]) -> Clearance:
@@ -130,7 +131,7 @@ def lift_out(
     low = distance < nearest
     if not low.any():
         return vertices, low
-    if len(vertices) > _FINE:
+    if len(vertices) > FINE_MESH:
         vertices, known = _lifted_at_sites(body, vertices, faces, nearest, iterations, known)
         iterations = _LAST
     moved = _lifted(body, vertices, faces, nearest, iterations, known)
@@ -169,7 +170,7 @@ def _lifted_at_sites(
 
     What is 1.5 distances from the skin or more stays.
     """
-    rows, coarse, label = coarse_mesh(vertices, faces, _SITES)
+    rows, coarse, label = coarse_mesh(vertices, faces, NUM_SITES)
     at = vertices[rows]
     moved = _lifted(body, at, coarse, nearest, iterations, (known[0][rows], known[1][rows]))
     near, weight = linear_weights(vertices, faces, rows, label)

@@ -14,7 +14,12 @@ from ._closest import (
     nearest_indices as nearest_indices,
     signed_distance as signed_distance,
 )
-from ._coarse import coarse_mesh as coarse_mesh, linear_weights as linear_weights
+from ._coarse import (
+    FINE_MESH as FINE_MESH,
+    NUM_SITES as NUM_SITES,
+    coarse_mesh as coarse_mesh,
+    linear_weights as linear_weights,
+)
 from ._edge_constraints import (
     EdgeConstraints as EdgeConstraints,
     limit_strain as limit_strain,

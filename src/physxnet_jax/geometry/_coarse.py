@@ -8,6 +8,8 @@ from scipy.sparse.csgraph import dijkstra
 from ._candidates import spread_points
 from ._topology import connected_components, mesh_edges
 
+FINE_MESH, NUM_SITES = 16_384, 8_192
+"""Meshes of more vertices are fine; about how many of them are sites."""
 # Greedily chosen points leave this share of their squared spacing to each.
 _DENSITY = 0.8
 # Vertices farther from all sites, in spacings along edges, get sites of their own.

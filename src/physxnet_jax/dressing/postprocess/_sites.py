@@ -7,11 +7,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...garment import Garment, SkinnedGarment, make_skinned, skin_garment
-from ...geometry import TriMesh, coarse_mesh, linear_weights
+from ...geometry import FINE_MESH, NUM_SITES, TriMesh, coarse_mesh, linear_weights
 from ...typing import pytree
-
-# Meshes of more vertices have sites, and about how many.
-_FINE, _SITES = 16_384, 8_192
 
 
 @pytree
@@ -73,13 +70,13 @@ def make_sites(garment: Garment, rest: Float[Array, "all 3"]) -> Sites | None:
         garment: The garment.
         rest: Rest vertices of the body [m].
     """
-    if garment.num_vertices <= _FINE or garment.elastic or garment.coarse_faces is not None:
+    if garment.num_vertices <= FINE_MESH or garment.elastic or garment.coarse_faces is not None:
         return None
     vertices, faces = (np.asarray(x) for x in (garment.mesh.vertices, garment.mesh.faces))
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     first = np.flatnonzero(np.asarray(garment.pinned) & used)
-    rows, coarse, label = coarse_mesh(vertices, faces, _SITES, first)
+    rows, coarse, label = coarse_mesh(vertices, faces, NUM_SITES, first)
     if not len(coarse):
         return None
     near, weight = linear_weights(vertices, faces, rows, label)
