@@ -2,6 +2,7 @@
 
 import os
 import pathlib
+import platform
 import subprocess
 import sys
 import threading
@@ -108,6 +109,31 @@ def test_compilation_cache_is_off_for_commands_that_measure_it():
     assert not uses_compilation_cache(["physxnet", "bench", "net"])
     assert not uses_compilation_cache(["physxnet", "effects", "scene.toml"])
     assert not uses_compilation_cache(["my_program.py", "dress"])
+
+
+HEAPS = """
+import ctypes, sys, threading
+sys.argv = [sys.argv[1]]
+import physxnet_jax
+gate = threading.Barrier(9)
+def keep():
+    ctypes.CDLL(None).malloc(1000)
+    gate.wait()
+for _ in range(8):
+    threading.Thread(target=keep).start()
+gate.wait()
+libc = ctypes.CDLL(None)
+libc.malloc_info(0, ctypes.c_void_p.in_dll(libc, "stdout"))
+libc.fflush(None)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="heaps of glibc")
+@pytest.mark.parametrize(("name", "several"), [("physxnet", False), ("other", True)])
+def test_threads_of_a_command_share_a_heap(name, several):
+    out = subprocess.run([sys.executable, "-c", HEAPS, name], capture_output=True, text=True)
+    heaps = out.stdout.count("<heap nr=")
+    assert (heaps > 1) == several and heaps, out.stderr
 
 
 def test_concurrent_atomic_writes_leave_one_complete_file(tmp_path):

@@ -14,6 +14,7 @@ from ._environment import (
     check_jaxlib as _check_jaxlib,
     enable_compilation_cache as _enable_compilation_cache,
     is_command as _is_command,
+    share_one_heap as _share_one_heap,
     uses_compilation_cache as _uses_compilation_cache,
 )
 from ._version import __version__ as __version__
@@ -21,6 +22,8 @@ from ._version import __version__ as __version__
 # A command is its own process; a program that imports this package decides for itself.
 if _uses_compilation_cache(_sys.argv):
     _enable_compilation_cache()
+if _is_command(_sys.argv):
+    _share_one_heap()
 
 # `physxnet doctor` must be able to report what is wrong.
 if not (_is_command(_sys.argv) and _sys.argv[1:2] == ["doctor"]):

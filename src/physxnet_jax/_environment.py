@@ -19,6 +19,8 @@ BROKEN_JAXLIB = {
 }
 _MAPS_ALLOWED = pathlib.Path("/proc/sys/vm/max_map_count")
 _MAPS_HELD = pathlib.Path("/proc/self/maps")
+# Of glibc's malloc.h.
+_M_ARENA_MAX = -8
 _FLAG = "xla_cpu_experimental_ynn_fusion_type="
 
 
@@ -136,6 +138,16 @@ def release_programs() -> None:
     # The allocator of glibc keeps what was freed.
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def share_one_heap() -> None:
+    """Makes all threads allocate from one heap; call it before they are started.
+
+    The allocator of glibc keeps a heap for each of many threads, and what one of them has freed is
+    of no use to the others: a fifth of all memory. Others have no such setting.
+    """
+    with contextlib.suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)
 
 
 def processor_name() -> str:

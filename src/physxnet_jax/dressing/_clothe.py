@@ -14,6 +14,7 @@ from .._environment import clear_caches_if_full
 from ..body import Body, skin_points
 from ..models import apply_sampled_offsets, normalise, point_features, predict_sampled
 from ..motion import ROTATION_LENGTHS, extrapolate_history
+from ..simulation.effects import TURBULENCE_PERIOD
 from ..typing import pytree
 from ._dresser import Dresser
 from ._guided import GuidedState, advance_guided, init_guided, move_guided
@@ -77,8 +78,8 @@ class Stream:
     guided: GuidedState | None = None
 
 
-# A person who has moved so far from `Stream.place` has another one [m].
-_FAR = 16.0
+# A person who has moved so far along an axis from `Stream.place` has another one [m].
+_FAR = 0.75 * TURBULENCE_PERIOD
 
 
 def _make_clothed(
@@ -359,7 +360,9 @@ def clothe_step(
 def _follow(stream: Stream, root: Float[Array, "3"]) -> tuple[Stream, Float[Array, "3"]]:
     """Moves the stream's place below a person who has gone far from it."""
     ahead = _on_ground(root)
-    ahead = jnp.where(jnp.sum(ahead**2) > _FAR**2, ahead, 0.0)
+    # By whole periods, in which the wind is the same.
+    steps = TURBULENCE_PERIOD * jnp.round(ahead / TURBULENCE_PERIOD)
+    ahead = jnp.where(jnp.abs(ahead) > _FAR, steps, 0.0)
     guided = stream.guided
     moved = dataclasses.replace(
         stream,

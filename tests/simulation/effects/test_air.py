@@ -14,7 +14,15 @@ from physxnet_jax.simulation import (
     prepare_scene,
     settle_on_static_body,
 )
-from physxnet_jax.simulation.effects import Air, Bend, Gravity, Membrane, Pin, Stretch
+from physxnet_jax.simulation.effects import (
+    TURBULENCE_PERIOD,
+    Air,
+    Bend,
+    Gravity,
+    Membrane,
+    Pin,
+    Stretch,
+)
 
 SOLVER = XPBD(32, 4)
 STIFF = Fabric(stretch=2000.0, bend=1e-2)
@@ -151,6 +159,17 @@ def test_turbulence_moves_with_the_wind():
     size = np.sqrt(np.mean(first**2))
     assert np.sqrt(np.mean((there - first) ** 2)) < 0.4 * size
     assert np.sqrt(np.mean((here - first) ** 2)) > 0.8 * size
+
+
+@pytest.mark.parametrize("eddy", [0.1, 0.5, 4.0])
+def test_turbulence_repeats_in_space(eddy):
+    """So that a person who walks far can be computed near the origin."""
+    air = Air(turbulence=1.0, eddy=eddy)
+    here, again, elsewhere = (
+        blown(air, 0.4, (0.0, 0.0, s)) for s in (0.0, TURBULENCE_PERIOD, 0.4 * TURBULENCE_PERIOD)
+    )
+    np.testing.assert_allclose(again, here, atol=2e-3)
+    assert np.abs(elsewhere - here).max() > 0.1
 
 
 def test_wind_changes_within_a_frame():

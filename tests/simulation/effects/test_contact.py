@@ -9,7 +9,7 @@ import pytest
 
 from physxnet_jax.body import NUM_BODY_VERTICES
 from physxnet_jax.garment import free_garment, square_sheet, template
-from physxnet_jax.geometry import closest_points, vertex_normals
+from physxnet_jax.geometry import closest_points, mesh_edges, vertex_normals
 from physxnet_jax.motion import Motion, animate, load_motion
 from physxnet_jax.simulation import (
     STANDARD,
@@ -17,12 +17,13 @@ from physxnet_jax.simulation import (
     Clock,
     PosedPoints,
     Scene,
+    _static_body,
     prepare_scene,
     settle_on_static_body,
     simulate,
 )
 from physxnet_jax.simulation._effect import Step
-from physxnet_jax.simulation.effects import BodyContact, Gravity, Pin, Stretch
+from physxnet_jax.simulation.effects import BodyContact, Gravity, Pin, Stretch, _contact
 
 FPS = 30.0
 CLOCK = Clock(jnp.float32(0.0), 1 / 120)
@@ -87,13 +88,7 @@ def test_cloth_that_starts_inside_leaves_at_bounded_speed(body, rest):
     """10 mm inside: out within a frame, no faster than the cap allows."""
     g = template("bottom")
     scene = prepare_scene(Scene((g,), (BodyContact(), Pin())))
-    x = scene.assembly.rest
-    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
-    hit = closest_points(mesh, jnp.asarray(x, jnp.float32))
-    tri = np.asarray(mesh.faces)[np.asarray(hit.face)]
-    foot = np.einsum("vk,vkc->vc", np.asarray(hit.weights), np.asarray(mesh.vertices)[tri])
-    away = (x - foot) / np.linalg.norm(x - foot, axis=1, keepdims=True)
-    sunk = foot - 0.010 * away
+    sunk = below_skin(body, rest, scene.assembly.rest, 0.010)
     out = settle_on_static_body(scene, 5, solver=XPBD(32, 4), start=sunk)
     d = out.diagnostics
     assert d["penetration_max"][0] < 1e-3
@@ -102,6 +97,60 @@ def test_cloth_that_starts_inside_leaves_at_bounded_speed(body, rest):
     reckless = prepare_scene(Scene((g,), (BodyContact(leave=1e6), Pin())))
     wild = settle_on_static_body(reckless, 5, solver=XPBD(32, 4), start=sunk)
     assert wild.diagnostics["speed_max"][0] > 3.0
+
+
+@pytest.mark.release
+def test_cloth_deep_in_an_arm_comes_out_on_its_own_side(body, rest, monkeypatch):
+    """As fast motion may leave it: beyond the middle, where the other side is nearer."""
+    scene = prepare_scene(Scene((template("top"),)))
+    x = scene.assembly.rest
+    ends = mesh_edges(scene.assembly.faces).vertices
+    length = np.linalg.norm(x[ends[:, 0]] - x[ends[:, 1]], axis=1)
+    monkeypatch.setattr(_static_body, "_out_of_body", lambda _, start: start)
+
+    def strain():
+        start = below_skin(body, rest, x, 0.050)
+        out = settle_on_static_body(scene, 10, solver=XPBD(32, 4), start=start).positions[0][-1]
+        return np.abs(np.linalg.norm(out[ends[:, 0]] - out[ends[:, 1]], axis=1) / length - 1).max()
+
+    assert strain() < 0.5
+    # The control: the nearest skin, whichever side it is.
+    jax.clear_caches()
+    monkeypatch.setattr(_contact._Contact, "raised", lambda _, points, *__: points)
+    assert strain() > 2.0
+    jax.clear_caches()
+
+
+@pytest.mark.parametrize("bad", [False, True])
+def test_a_start_deep_in_the_body_is_taken_out_with_what_is_around(bad):
+    """Half of a top deep in it, the other half 5 mm off; a start outside it stays as it is."""
+    scene = prepare_scene(Scene((template("top"),)))
+    x = scene.assembly.rest
+    start = x + 0.005 * np.sign(x[:, :1])
+    if bad:
+        low = x[:, 1] < np.median(x[:, 1])
+        start[low] -= [0.0, 0.0, 0.1] * np.sign(x[low, 2:])
+    out = _static_body._out_of_body(scene.assembly, start)
+    kept = (out == start).all(axis=1)
+    if not bad:
+        assert kept.all()
+        return
+    assert 0.3 < kept.mean() < 0.8 and not kept[low].all()
+    np.testing.assert_array_equal(out[~kept], x[~kept])
+    ends = mesh_edges(scene.assembly.faces).vertices
+    mixed = ends[kept[ends].any(axis=1) & ~kept[ends].all(axis=1)]
+    rest, length = (np.linalg.norm(p[mixed[:, 0]] - p[mixed[:, 1]], axis=1) for p in (x, out))
+    assert len(mixed) and np.abs(length / rest - 1).max() <= 0.5
+
+
+def below_skin(body, rest, x, depth):
+    """Points at a depth below the skin that is closest to them [m]."""
+    mesh = body.mesh(rest[:NUM_BODY_VERTICES])
+    hit = closest_points(mesh, jnp.asarray(x, jnp.float32))
+    tri = np.asarray(mesh.faces)[np.asarray(hit.face)]
+    foot = np.einsum("vk,vkc->vc", np.asarray(hit.weights), np.asarray(mesh.vertices)[tri])
+    away = (x - foot) / np.linalg.norm(x - foot, axis=1, keepdims=True)
+    return foot - depth * away
 
 
 @pytest.mark.release

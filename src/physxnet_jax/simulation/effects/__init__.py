@@ -1,6 +1,6 @@
 """The effects that a scene can list, one module each."""
 
-from ._air import Air as Air
+from ._air import TURBULENCE_PERIOD as TURBULENCE_PERIOD, Air as Air
 from ._bend import Bend as Bend
 from ._contact import BodyContact as BodyContact
 from ._damping import Damping as Damping

@@ -35,7 +35,7 @@ class Air(Effect):
         gust: Amplitude of the gusts, relative to the mean wind [1].
         period: Period of the gusts [s].
         turbulence: Root mean square of the turbulent velocity [m/s].
-        eddy: Size of the largest eddies [m].
+        eddy: Size of the largest eddies [m]; turbulence repeats every `TURBULENCE_PERIOD`.
         seed: Random seed of the turbulence.
         density: Density of the air [kg/m^3].
         normal: Drag coefficient normal to the cloth [1].
@@ -92,6 +92,9 @@ class Air(Effect):
             k *= (
                 2 * np.pi / self.eddy * 2.0 ** rng.uniform(0, 2, _MODES) / np.linalg.norm(k, axis=1)
             )[:, None]
+            # Whole waves in the distance of repetition; eddies as large as that aren't repeated.
+            whole = np.round(k * TURBULENCE_PERIOD / (2 * np.pi))
+            k = np.where(whole.any(axis=1)[:, None], whole * 2 * np.pi / TURBULENCE_PERIOD, k)
             way = np.cross(k, rng.normal(size=(_MODES, 3)))
             way *= (self.turbulence * np.sqrt(2.0 / _MODES) / np.linalg.norm(way, axis=1))[:, None]
             rate = np.linalg.norm(k, axis=1) * max(self.turbulence, 1e-3)
@@ -127,6 +130,8 @@ class Air(Effect):
 
 
 _MODES = 16
+TURBULENCE_PERIOD = 16.0
+"""Distance along the axes at which the same turbulence comes again [m]."""
 # Distance between skin samples [m], number of samples per vertex, and reach of their lee [m].
 _SPACING, _NEIGHBOURS, _REACH = 0.05, 4, 0.15
 
