@@ -96,16 +96,41 @@ def test_missing_extras_are_named_and_sufficient_once_installed(python, wheel, t
         assert "needs" not in run(python, "-c", script, cwd=tmp_path), extra
 
 
+TENSORBOARD = (
+    "import pathlib; from physxnet_jax.training._monitor import TensorBoardLogger\n"
+    "b = TensorBoardLogger(pathlib.Path('run')); b.write({'loss': 1.0}, 0); b.close()\n"
+    "print(len(list(pathlib.Path('run').rglob('events.*'))))"
+)
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
+@pytest.mark.parametrize("extra", ["wheel", "sdist", "train", *EXTRAS])
+def test_base_and_each_extra_alone_work_on_each_python(version, extra, wheel, tmp_path):
+    """In an environment of its own."""
+    if subprocess.run([UV, "python", "find", "--offline", version], capture_output=True).returncode:
+        pytest.skip(f"Python {version} isn't installed")
+    package = f"{wheel}[{extra}]" if extra not in ("wheel", "sdist") else wheel
+    if extra == "sdist":
+        run(UV, "build", "--quiet", "--sdist", "--out-dir", tmp_path, ROOT)
+        (package,) = tmp_path.glob("*.tar.gz")
+    python = tmp_path / "env" / "bin" / "python"
+    run(UV, "venv", "--quiet", "--offline", "--python", version, tmp_path / "env")
+    run(UV, "pip", "install", "--quiet", "--python", python, package)
+    assert run(python, "--version").split()[1].startswith(version)
+    if extra in EXTRAS:
+        run(python, "-c", EXTRAS[extra], cwd=tmp_path)
+    elif extra == "train":
+        assert run(python, "-c", TENSORBOARD, cwd=tmp_path).split()[-1] == "1"
+    else:
+        test_command_works_without_optional_dependencies(python, tmp_path)
+
+
 def test_tensorboard_events_are_written_only_with_the_train_extra(python, wheel, tmp_path):
     """Without it training goes on, unwatched."""
-    script = (
-        "import pathlib; from physxnet_jax.training._monitor import TensorBoardLogger\n"
-        "b = TensorBoardLogger(pathlib.Path('run')); b.write({'loss': 1.0}, 0); b.close()\n"
-        "print(len(list(pathlib.Path('.').rglob('events.*'))))"
-    )
-    assert run(python, "-c", script, cwd=tmp_path).split()[-1] == "0"
+    assert run(python, "-c", TENSORBOARD, cwd=tmp_path).split()[-1] == "0"
     run(UV, "pip", "install", "--quiet", "--python", python, f"{wheel}[train]")
-    assert run(python, "-c", script, cwd=tmp_path).split()[-1] == "1"
+    assert run(python, "-c", TENSORBOARD, cwd=tmp_path).split()[-1] == "1"
 
 
 def test_imports_are_lazy_and_load_no_optional_library():
