@@ -22,6 +22,7 @@ from physxnet_jax.dressing._character import (
     character_penetration,
     resolve_character_collisions,
 )
+from physxnet_jax.dressing.postprocess import _sites
 from physxnet_jax.dressing.postprocess._collisions import faces_at_rest, make_collider
 from physxnet_jax.dressing.postprocess._layers import layer_height
 from physxnet_jax.errors import PhysXNetError
@@ -214,6 +215,26 @@ def test_guided_cloth_is_moved_out_of_the_character_surface(character):
     assert found[True].method == "guided" and found[False].inside["bottom"] > 0.01
     assert found[False].inside == found[False].inside_raw
     assert found[True].inside["bottom"] < 0.5 * found[True].inside_raw["bottom"]
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("method", ["lbs", "network", "guided"])
+def test_fine_garments_on_a_character_are_near_those_of_all_vertices(
+    character, method, monkeypatch
+):
+    found = {}
+    for limit in (2_000, 10**9):
+        monkeypatch.setattr(_sites, "FINE_MESH", limit)
+        monkeypatch.setattr(_sites, "NUM_SITES", 900)
+        clip = dress(
+            character, ["bottom"], method=method, inference=Inference(weights="nano"), frames=4
+        )
+        found[limit] = np.asarray(clip.garments[0].positions)
+        assert clip.inside["bottom"] < 0.02
+    a, b = found.values()
+    assert a.shape == b.shape and np.isfinite(a).all() and not np.array_equal(a, b)
+    gap = np.linalg.norm(a - b, axis=2)
+    assert np.quantile(gap, 0.95) < {"lbs": 0.010, "network": 0.012, "guided": 0.03}[method]
 
 
 @pytest.mark.release
