@@ -1,7 +1,8 @@
 """Uses the Blender extension in Blender without a window, as installed from its zip.
 
 Command: python experiments/blender_extension.py --python PYTHON_WITH_BPY [PYTHON_WITH_BPY ...]
-         [--pictures]
+         [--pictures] [--mpfb ZIP]
+         (the zip of MPFB, from extensions.blender.org; dressed too, if given)
          (`pip install bpy==4.2.0` in a Python 3.11, and bpy 5.0.1 in another)
 Cost:    two minutes for each Blender on one core.
 Result:  experiments/results/blender_extension.json and .md, the table of docs/blender.md.
@@ -31,17 +32,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--python", nargs="+", required=True, help="Pythons that have bpy")
     parser.add_argument("--pictures", action="store_true", help="render those of docs/blender.md")
+    parser.add_argument("--mpfb", type=pathlib.Path, help="zip of MPFB")
     words = parser.parse_args()
     rows = []
     for k, python in enumerate(words.python):
-        rows += check(python, ROOT / "docs" if words.pictures and k == 0 else None)
+        rows += check(python, ROOT / "docs" if words.pictures and k == 0 else None, words.mpfb)
     write_json(RESULT, rows)
     with atomic_write(RESULT.with_suffix(".md")) as part:
         part.write_text(table(rows))
     sys.stdout.write(table(rows))
 
 
-def check(python: str, pictures: pathlib.Path | None = None) -> list[dict[str, object]]:
+def check(
+    python: str, pictures: pathlib.Path | None = None, mpfb: pathlib.Path | None = None
+) -> list[dict[str, object]]:
     """The results of one Blender."""
     with tempfile.TemporaryDirectory() as folder:
         where = pathlib.Path(folder)
@@ -61,7 +65,8 @@ def check(python: str, pictures: pathlib.Path | None = None) -> list[dict[str, o
         own.pop("PYTHONPATH", None)
         script = ROOT / "integrations/blender/headless.py"
         words = [python, str(script), str(archive), str(person), str(garment), folder]
-        words += [] if pictures is None else [str(pictures)]
+        words += [] if pictures is None else ["--pictures", str(pictures)]
+        words += [] if mpfb is None else ["--mpfb", str(mpfb.resolve())]
         ended = subprocess.run(words, env=own, capture_output=True, text=True, timeout=1200)
     found = [
         json.loads(line.removeprefix("RESULT "))

@@ -3,6 +3,7 @@
 In JSON files measured times may differ; tables and charts of such times need only be there.
 """
 
+import contextlib
 import json
 import os
 import pathlib
@@ -96,27 +97,31 @@ def test_a_build_on_ray_killed_five_times_has_the_same_bytes(place):
     pytest.importorskip("ray", reason="Ray isn't installed: pip install 'physxnet-jax[cluster]'")
     folder, digest = place
     chance = random.Random(1)
-    killed = []
+    victims = ["driver", "worker", "worker", "driver", "worker"]
     process = build(folder, "ray", "--ray")
-    while len(killed) < 5:
+    while victims:
         time.sleep(chance.uniform(3.0, 12.0))
+        # On a slow machine workers are long in coming.
+        while victims[0] == "worker" and process.poll() is None and not workers_of():
+            time.sleep(0.1)
         if process.poll() is not None:
             # It was done: all of it again.
             for path in (folder / "ray").glob("*/bottom/zarr.json"):
                 path.unlink()
             process = build(folder, "ray", "--ray")
             continue
-        workers = workers_of()
-        victim = chance.choice([process.pid, *workers])
-        killed.append("driver" if victim == process.pid else "worker")
-        os.kill(victim, signal.SIGKILL)
-        if victim == process.pid:
+        if victims[0] == "worker":
+            with contextlib.suppress(ProcessLookupError, IndexError):
+                os.kill(chance.choice(workers_of()), signal.SIGKILL)
+                victims.pop(0)
+        else:
+            victims.pop(0)
+            process.kill()
             process.wait()
             process = build(folder, "ray", "--ray")
     process.wait(300)
     assert build(folder, "ray", "--ray").wait(300) == 0
     assert dataset_digest(folder / "ray") == digest
-    assert len(set(killed)) == 2, killed
 
 
 @pytest.mark.nightly

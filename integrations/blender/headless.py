@@ -2,10 +2,12 @@
 
 Command: experiments/blender_extension.py calls it, once for each Blender.
          PYTHON_WITH_BPY integrations/blender/headless.py ZIP PERSON.glb GARMENT.obj FOLDER
-         [PICTURES]
+         [--pictures FOLDER] [--mpfb ZIP]
 Result:  a line of JSON for each check on stdout.
 """
 
+import argparse
+import importlib
 import json
 import os
 import pathlib
@@ -73,10 +75,60 @@ def error_of(call) -> str:
     return ""
 
 
+def worn(cloth, body):
+    """Largest median distance from the person over ten frames, and the cloth in each [m]."""
+    count, far, places = len(cloth.data.vertices), [], []
+    for frame in range(1, 11):
+        bpy.context.scene.frame_set(frame)
+        x, skin = vertices(cloth)[:count], vertices(body)
+        gap = np.linalg.norm(x[::7, None] - skin[None, ::5], axis=2).min(axis=1)
+        far.append(float(np.median(gap)))
+        places.append(x.mean(axis=0))
+    return max(far), places
+
+
+def try_mpfb(archive) -> None:
+    """Dresses a character of MPFB, whose mesh holds helpers that a modifier hides."""
+    bpy.ops.extensions.package_install_files(
+        filepath=archive, repo="user_default", enable_on_install=True
+    )
+    scene, settings = bpy.context.scene, bpy.context.scene.physxnet
+    for o in list(scene.objects):
+        bpy.data.objects.remove(o)
+    settings.garments.clear()
+    module = next(a.module for a in bpy.context.preferences.addons if a.module.endswith(".mpfb"))
+    service = importlib.import_module(module + ".services.humanservice").HumanService
+    body = service.create_human()
+    settings.person = armature = service.add_builtin_rig(body, "game_engine")
+    for frame, turn in ((1, 0.0), (10, -0.7)):
+        for name in ("thigh_l", "upperarm_r"):
+            bone = armature.pose.bones[name]
+            bone.rotation_mode, bone.rotation_euler = "XYZ", (turn, 0.0, 0.0)
+            bone.keyframe_insert("rotation_euler", frame=frame)
+    settings.tailored, settings.method = "shirt trousers", "guided"
+    settings.first, settings.last = 1, 10
+    bpy.ops.physxnet.dress()
+    found = []
+    for name in ("shirt", "trousers"):
+        far, places = worn(scene.objects[name], body)
+        found.append((far, float(np.linalg.norm(places[-1] - places[0]))))
+    say(
+        "a character of MPFB is dressed",
+        all(far < 0.04 and way > 0.005 for far, way in found),
+        ", ".join(f"{1e3 * far:.0f} mm" for far, _ in found),
+    )
+
+
 def main() -> None:
     """Runs all checks."""
-    archive, person, garment, folder = sys.argv[1:5]
-    pictures = pathlib.Path(sys.argv[5]) if len(sys.argv) > 5 else None
+    parser = argparse.ArgumentParser()
+    for name in ("archive", "person", "garment", "folder"):
+        parser.add_argument(name)
+    parser.add_argument("--pictures", type=pathlib.Path)
+    parser.add_argument("--mpfb")
+    words = parser.parse_args()
+    archive, person, garment, folder = words.archive, words.person, words.garment, words.folder
+    pictures = words.pictures
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.extensions.package_install_files(
         filepath=archive, repo="user_default", enable_on_install=True
@@ -124,15 +176,9 @@ def main() -> None:
     say("materials and modifiers are kept", kept)
     off = not cloth.modifiers["Armature"].show_viewport
     say("the armature no longer moves the garment", off)
-    count, far, moved = len(cloth.data.vertices), [], []
-    for frame in range(1, 11):
-        scene.frame_set(frame)
-        x, skin = vertices(cloth)[:count], vertices(body)
-        gap = np.linalg.norm(x[::7, None] - skin[None, ::5], axis=2).min(axis=1)
-        far.append(float(np.median(gap)))
-        moved.append(x.mean(axis=0))
-    say("cloth lies on the person in every frame", max(far) < 0.04, f"{1e3 * max(far):.0f} mm")
-    way = float(np.linalg.norm(moved[-1] - moved[0]))
+    far, places = worn(cloth, body)
+    say("cloth lies on the person in every frame", far < 0.04, f"{1e3 * far:.0f} mm")
+    way = float(np.linalg.norm(places[-1] - places[0]))
     say("cloth goes where the person goes", way > 0.1, f"{way:.2f} m in ten frames")
     cache = list((pathlib.Path(folder) / "physxnet_cache").glob("*.pc2"))
     say("the cache lies beside the file", len(cache) == 1)
@@ -153,6 +199,9 @@ def main() -> None:
     bpy.context.view_layer.update()
     text = error_of(bpy.ops.physxnet.dress)
     say("a garment elsewhere is refused with a reason", "from one scene" in text)
+    cloth.location.x -= 40.0
+    if words.mpfb is not None:
+        try_mpfb(words.mpfb)
     module = next(a.module for a in bpy.context.preferences.addons if "physxnet" in a.module)
     bpy.ops.preferences.addon_disable(module=module)
     say("it unregisters", not hasattr(bpy.types.Scene, "physxnet"))

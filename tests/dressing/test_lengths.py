@@ -77,7 +77,7 @@ inference = px.Inference(weights="nano")
 kinds = ["shirt", "trousers", "shorts", "skirt", "tee"]
 times = []
 for k in range(50):
-    word = f"{kinds[k % 5]}:ease={0.04 + 0.002 * k:.3f}"
+    word = f"{kinds[k % 5]}:ease={0.06 + 0.0015 * k:.4f}"
     dresser = px.make_dresser([word], inference=inference)
     for _ in range(20):
         n = int(rng.integers(1, 100))
