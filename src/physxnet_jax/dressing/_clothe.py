@@ -304,7 +304,9 @@ def init_stream(
     points = jax.vmap(lambda a, b: skin_points(texels.rest, texels.weights, a, b)[0])(r, t)
     scene = dresser.guided
     guided = None if scene is None else init_guided(scene, r[-1], t[-1])
-    return dataclasses.replace(stream, points=points, guided=guided)
+    stream = dataclasses.replace(stream, points=points, guided=guided)
+    # Each part in a buffer of its own: `clothe_step` may be given all of them.
+    return jax.tree.map(jnp.copy, stream)
 
 
 def clothe_step(
