@@ -14,6 +14,7 @@ import pytest
 from physxnet_jax._environment import (
     cache_folder,
     clear_caches_if_full,
+    compile_whole_programs,
     enable_compilation_cache,
     uses_compilation_cache,
 )
@@ -109,6 +110,39 @@ def test_compilation_cache_is_off_for_commands_that_measure_it():
     assert not uses_compilation_cache(["physxnet", "bench", "net"])
     assert not uses_compilation_cache(["physxnet", "effects", "scene.toml"])
     assert not uses_compilation_cache(["my_program.py", "dress"])
+
+
+def test_own_flags_of_xla_are_kept_and_unknown_versions_left_alone():
+    env = {"XLA_FLAGS": "--xla_cpu_use_fusion_emitters=true --xla_a=1"}
+    compile_whole_programs(env, "0.10.1")
+    assert env["XLA_FLAGS"].split() == [
+        "--xla_cpu_use_fusion_emitters=true",
+        "--xla_a=1",
+        "--xla_cpu_parallel_codegen_split_count=2",
+    ]
+    untried: dict[str, str] = {}
+    compile_whole_programs(untried, "0.99.0")
+    assert not untried
+
+
+FLAGS = """
+import os, sys
+sys.argv = [sys.argv[1]]
+import physxnet_jax
+import jax.numpy as jnp
+# XLA would end the process at a flag that it doesn't know.
+print(jnp.ones(3).sum(), os.environ.get("XLA_FLAGS", ""))
+"""
+
+
+@pytest.mark.parametrize("name", ["physxnet", "other"])
+def test_commands_alone_set_flags_that_this_xla_knows(name):
+    env = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    out = subprocess.run(
+        [sys.executable, "-c", FLAGS, name], capture_output=True, text=True, env=env
+    )
+    assert out.stdout.startswith("3.0"), out.stderr
+    assert ("xla_cpu_use_fusion_emitters=false" in out.stdout) == (name == "physxnet")
 
 
 HEAPS = """

@@ -330,3 +330,22 @@ def test_signals_wait_for_the_end_and_act_then(number):
     finally:
         signal.signal(number, before)
     assert reached == ["held"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_what_is_no_ordinary_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "pipe.npz")
+    (tmp_path / "link.npz").symlink_to(tmp_path / "pipe.npz")
+    for name in ("pipe.npz", "link.npz"):
+        with pytest.raises(FormatError, match="ordinary file"), atomic_write(tmp_path / name):
+            pass
+    assert (tmp_path / "pipe.npz").is_fifo()
+
+
+def test_links_to_themselves_and_long_names_are_refused_before_the_work(tmp_path):
+    (tmp_path / "self.npz").symlink_to(tmp_path / "self.npz")
+    with pytest.raises(FormatError, match="leads to itself"):
+        check_writable(tmp_path / "self.npz")
+    check_writable(tmp_path / ("n" * 180 + ".npz"))
+    with pytest.raises(FormatError, match="too long"):
+        check_writable(tmp_path / ("n" * 225 + ".npz"))

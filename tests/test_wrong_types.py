@@ -8,10 +8,15 @@ import pytest
 from physxnet_jax.errors import PhysXNetError, check_type
 
 CODE = """
+import jax
 import numpy as np
 import physxnet_jax as px
 
 walk, top = px.load_motion("walk"), px.template("top")
+bare = px.make_dresser(["top"], method="lbs")
+# Poses may be arrays of NumPy, also where others are traced.
+root = np.asarray(walk.root[:1])
+jax.jit(lambda q: px.clothe(bare, q, root, 30.0)["top"])(np.asarray(walk.rotations[:1]))
 for call in (
     lambda: px.load_motion(5),
     lambda: px.dress(np.zeros((3, 31, 4)), ["top"]),
@@ -22,6 +27,14 @@ for call in (
     lambda: px.simulate(px.Scene(("top",)), walk),
     lambda: px.dress("walk", ["top"], frames="3"),
     lambda: px.dress("walk", ["top"], start="1"),
+    lambda: px.make_dresser(["top"], method="simulate"),
+    lambda: px.make_dresser(["top"], precision="float64"),
+    lambda: px.Simulation(engine="bdf"),
+    lambda: px.clothe(bare, walk.rotations, walk.root, "30"),
+    lambda: px.simulate(px.Scene((top,)), px.Motion(walk.rotations, walk.root[:3], 30.0)),
+    lambda: px.simulate(px.Scene((top,)), px.Motion(0 * walk.rotations, walk.root, 30.0)),
+    lambda: px.simulate(px.Scene((top,)), px.Motion(walk.rotations, walk.root, -30.0)),
+    lambda: px.simulate(px.Scene((top,), shape=np.full(9, 5.0)), walk),
 ):
     try:
         call()
@@ -34,9 +47,11 @@ for call in (
 def test_errors_say_what_to_pass():
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, timeout=300)
     lines = done.stdout.splitlines()
-    assert done.returncode == 0 and len(lines) == 9, done.stdout + done.stderr[-2000:]
+    assert done.returncode == 0 and len(lines) == 17, done.stdout + done.stderr[-2000:]
     advice = ["A motion is", "A motion is", "a Scene", "a Scene", "a Motion", "a tuple", "garments"]
     advice += ["a whole number", "a number of seconds"]
+    advice += ["No method", "No precision", "No engine", "fps is '30'", "3 places of the root"]
+    advice += ["no rotation", "fps is -30.0", "limits"]
     assert all(some in line for some, line in zip(advice, lines, strict=True))
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING as _TYPE_CHECKING
 
 from ._environment import (
     check_jaxlib as _check_jaxlib,
+    compile_whole_programs as _compile_whole_programs,
     enable_compilation_cache as _enable_compilation_cache,
     is_command as _is_command,
     share_one_heap as _share_one_heap,
@@ -24,6 +25,7 @@ if _uses_compilation_cache(_sys.argv):
     _enable_compilation_cache()
 if _is_command(_sys.argv):
     _share_one_heap()
+    _compile_whole_programs()
 
 # `physxnet doctor` must be able to report what is wrong.
 if not (_is_command(_sys.argv) and _sys.argv[1:2] == ["doctor"]):

@@ -19,6 +19,8 @@ BROKEN_JAXLIB = {
 }
 _MAPS_ALLOWED = pathlib.Path("/proc/sys/vm/max_map_count")
 _MAPS_HELD = pathlib.Path("/proc/self/maps")
+_FEW_PARTS = ("--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=2")
+_TRIED = ("0.10.1",)
 # Of glibc's malloc.h.
 _M_ARENA_MAX = -8
 _FLAG = "xla_cpu_experimental_ynn_fusion_type="
@@ -138,6 +140,31 @@ def release_programs() -> None:
     # The allocator of glibc keeps what was freed.
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
+
+
+def compile_whole_programs(
+    environment: MutableMapping[str, str] | None = None, version: str | None = None
+) -> None:
+    """Makes XLA compile a program in few parts on processors; call it before jax is imported.
+
+    By default each fused loop is a library of its own. Programs of hundreds of loops then take
+    twice as long to compile, and more memory.
+
+    Args:
+        environment: Environment variables to change; those of this process by default. Flags that
+            are already in ``XLA_FLAGS`` keep their values.
+        version: Version of jaxlib. XLA ends the process at a flag that it doesn't know: nothing
+            is changed for versions on which this wasn't tried.
+    """
+    env = os.environ if environment is None else environment
+    version = importlib.metadata.version("jaxlib") if version is None else version
+    if version not in _TRIED:
+        return
+    flags = env.get("XLA_FLAGS", "").split()
+    known = {f.partition("=")[0] for f in flags}
+    env["XLA_FLAGS"] = " ".join(
+        [*flags, *(f for f in _FEW_PARTS if f.partition("=")[0] not in known)]
+    )
 
 
 def share_one_heap() -> None:

@@ -2,6 +2,7 @@
 
 import math
 import numbers
+import typing
 
 # Messages quote file contents, which can be arbitrarily long.
 _MOST, _LAST = 1200, 500
@@ -108,6 +109,30 @@ def check_counts(owner: object, *names: str) -> None:
         value = getattr(owner, name)
         if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
             raise ValueError(f"{name} is {value}, expected a whole number of at least 1")
+
+
+def check_rate(fps: object) -> None:
+    """Raises an error unless frames per second are a positive number.
+
+    Raises:
+        PhysXNetError: They aren't; the message names the value.
+    """
+    number = isinstance(fps, numbers.Real) and not isinstance(fps, bool)
+    if not number or not 0.0 < float(typing.cast(typing.Any, fps)) < math.inf:
+        raise PhysXNetError(f"fps is {fps!r}, expected a positive number.")
+
+
+def check_choices(owner: object, *names: str) -> None:
+    """Checks that attributes of a settings object are among those of their type, a Literal.
+
+    Raises:
+        ValueError: An attribute is something else; the message names it and the choices.
+    """
+    hints = typing.get_type_hints(type(owner))
+    for name in names:
+        value, there = getattr(owner, name), typing.get_args(hints[name])
+        if value not in there:
+            raise ValueError(f"{name} is {value!r}; there are {', '.join(map(str, there))}.")
 
 
 def check_type(value: object, kinds: type | tuple[type, ...], advice: str) -> None:

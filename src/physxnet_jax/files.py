@@ -13,6 +13,7 @@ import platform
 import re
 import shutil
 import signal
+import stat
 import tempfile
 import threading
 import zipfile
@@ -33,23 +34,32 @@ _HOST = f"{zlib.crc32(platform.node().encode()):08x}"
 _PART = re.compile(r"\.part-([0-9a-f]{8})-(\d+)-")
 # Files that the running command reads and their times of change [ns], by device and inode.
 _inputs: dict[tuple[int, int], tuple[pathlib.Path, int]] = {}
+_keeping = False
 _swept: set[pathlib.Path] = set()
+# Longest name of a file on most systems, and what names of unfinished parts add [bytes].
+_LONGEST_NAME, _ADDED = 255, 60
 
 
 @contextlib.contextmanager
 def keep_inputs() -> Iterator[None]:
     """Within it, files of `add_inputs` aren't replaced by `atomic_write`."""
-    before = dict(_inputs)
+    global _keeping
+    before, keeping, _keeping = dict(_inputs), _keeping, True
     try:
         yield
     finally:
+        _keeping = keeping
         _inputs.clear()
         _inputs.update(before)
 
 
 def add_inputs(*paths: str | pathlib.Path) -> None:
-    """Notes files that a command reads; what doesn't exist is skipped."""
-    for path in paths:
+    """Notes files that a command reads; what doesn't exist is skipped.
+
+    Readers call it for every file that they open. Outside `keep_inputs` it does nothing: a program
+    may replace what it has read.
+    """
+    for path in paths if _keeping else ():
         with contextlib.suppress(OSError, ValueError):
             if os.path.isfile(path):
                 found = os.stat(path)
@@ -66,12 +76,15 @@ def check_replaceable(path: str | pathlib.Path) -> None:
     """Checks that writing a file destroys nothing that a person may want to keep.
 
     Raises:
-        FormatError: It is an input of the running command, under whatever name, or read-only.
+        FormatError: It is an input of the running command, under whatever name, read-only, or no
+            ordinary file.
     """
     try:
         found = os.stat(path)
     except OSError:
         return
+    if not stat.S_ISREG(found.st_mode):
+        raise FormatError(f"{path}: this isn't an ordinary file. Choose another output.")
     known, changed = _inputs.get((found.st_dev, found.st_ino), (None, 0))
     # A file that was deleted leaves its inode to another, which isn't an input.
     if known is not None and (found.st_mtime_ns == changed or _names(known, found)):
@@ -101,8 +114,7 @@ def atomic_write(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
         ['a.txt']
     """
     path = pathlib.Path(path)
-    if path.is_symlink():
-        path = path.resolve()
+    path = _followed(path)
     check_replaceable(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     _sweep(path.parent)
@@ -125,6 +137,17 @@ def atomic_write(path: str | pathlib.Path) -> Iterator[pathlib.Path]:
         raise
     finally:
         part.unlink(missing_ok=True)
+
+
+def _followed(path: pathlib.Path) -> pathlib.Path:
+    """What a link points to."""
+    if not path.is_symlink():
+        return path
+    try:
+        return path.resolve()
+    # Of a link that leads back to itself.
+    except (OSError, RuntimeError):
+        raise FormatError(f"{path}: a link that leads to itself. Choose another output.") from None
 
 
 def _sweep(folder: pathlib.Path) -> None:
@@ -324,10 +347,14 @@ def check_writable(path: str | pathlib.Path, size: int = 0) -> None:
         DiskFullError: Less is free than it needs.
     """
     path = pathlib.Path(path)
-    if path.is_symlink():
-        path = path.resolve()
+    path = _followed(path)
     if path.is_dir():
         raise FormatError(f"{path}: this is a folder. Name a file in it.")
+    if len(os.fsencode(path.name)) > _LONGEST_NAME - _ADDED:
+        raise FormatError(
+            f"{path.name[:40]}…: the name is too long. Choose one of at most"
+            f" {_LONGEST_NAME - _ADDED} bytes."
+        )
     check_replaceable(path)
     existing = next((p for p in path.absolute().parents if p.exists()), pathlib.Path("/"))
     try:

@@ -1,6 +1,9 @@
 """What is printed carries no control characters."""
 
 import io
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -62,3 +65,22 @@ def test_names_of_meshes_do_not_reset_the_terminal(tmp_path, capsys):
     assert main(["inspect", str(path)]) != 0
     said = capsys.readouterr()
     assert said.out + said.err and not has_controls(said.out) and not has_controls(said.err)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX")
+@pytest.mark.parametrize("words", ["clips", "clips --json", "--help"])
+def test_a_closed_pipe_has_an_exit_code_of_its_own(words):
+    run = "import sys; from physxnet_jax.cli import main; sys.exit(main())"
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, "-c", run, *words.split()], stdout=write, stderr=subprocess.PIPE
+    )
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, b"")
+
+
+def test_an_option_that_is_given_twice_is_refused(capsys):
+    with pytest.raises(SystemExit) as ended:
+        main(["dress", "walk", "--wear", "shirt", "--wear", "trousers"])
+    assert ended.value.code == 2 and "--wear is given twice" in capsys.readouterr().err

@@ -199,3 +199,43 @@ def test_shapes_beyond_their_limits_are_refused(dresser, motion):
 def test_a_place_that_is_not_finite_is_the_origin():
     broken = dataclasses.replace(load_motion("walk", fps=30.0)[:2], root=jnp.full((2, 3), jnp.nan))
     assert not ground_point(broken).any()
+
+
+@pytest.mark.release
+def test_a_stream_that_begins_with_a_bad_pose_is_well_once_it_has_seen_good_ones(dresser, motion):
+    q, p = motion.rotations, motion.root
+    frames = max(dresser.seen(30.0)) + 2
+    for first, expected in ((q[:1] * jnp.nan, False), (q[:1], True)):
+        stream, found = init_stream(dresser, first, p[:1]), []
+        for k in range(frames):
+            stream, now = step(dresser, stream, q[k], p[k])
+            found.append(bool(now.ok))
+        assert found[0] == (expected or frames == 2) and found[-1]
+
+
+@pytest.mark.parametrize("fps", [0.0, -30.0, np.nan, np.inf])
+def test_rates_that_are_none_are_refused(fps):
+    dresser = make_dresser(["bottom"], method="lbs")
+    still = load_motion("walk", fps=30.0)[:1]
+    stream = init_stream(dresser, still.rotations, still.root)
+    for call in (
+        lambda: clothe(dresser, still.rotations, still.root, fps),
+        lambda: init_stream(dresser, still.rotations, still.root, fps),
+        lambda: clothe_step(dresser, stream, still.rotations[0], still.root[0], fps),
+    ):
+        with pytest.raises(PhysXNetError, match="fps"):
+            call()
+
+
+@pytest.mark.release
+@pytest.mark.parametrize("method", ["network", "guided"])
+def test_new_streams_can_be_donated(method):
+    dresser = make_dresser(["bottom"], method=method, inference=NANO)
+    motion = load_motion("walk", fps=30.0)[:3]
+    q, p = motion.rotations, motion.root
+    given = jax.jit(clothe_step, static_argnames="fps", donate_argnames="stream")
+    stream, kept = init_stream(dresser, q[:2], p[:2]), init_stream(dresser, q[:2], p[:2])
+    found = given(dresser, stream, q[2], p[2], fps=30.0)[1]
+    np.testing.assert_allclose(
+        found["bottom"], clothe_step(dresser, kept, q[2], p[2], 30.0)[1]["bottom"], atol=1e-3
+    )

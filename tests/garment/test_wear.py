@@ -120,7 +120,7 @@ def test_fabric_files_with_faults_are_refused_by_name(text, match, tmp_path):
 
 
 def test_fabric_files_that_are_not_there_are_named(tmp_path):
-    with pytest.raises(FormatError, match="No such file"):
+    with pytest.raises(FormatError, match="no such file"):
         find_fabric(tmp_path / "none.toml")
     with pytest.raises(PhysXNetError, match="No fabric 'tin'; there are cotton"):
         find_fabric("tin")

@@ -1,5 +1,6 @@
 """MDD, glTF and OBJ sequences, read back by readers that share no code with the writers."""
 
+import dataclasses
 import json
 import pathlib
 import struct
@@ -197,3 +198,35 @@ def test_gltf_morph_targets_include_the_normals_of_each_frame(tmp_path, clip):
         for k, x in enumerate(m.positions):
             seen = base + (moved[k - 1] if k else 0.0)
             np.testing.assert_allclose(seen, area_normals(x, m.faces)[rows], atol=1e-5)
+
+
+@pytest.mark.parametrize("suffix", ["npz", "obj", "pc2", "mdd", "glb"])
+def test_meshes_of_one_name_are_all_written(tmp_path, clip, suffix):
+    """As two people in a shirt; names may differ in what file names can't hold alone."""
+    meshes, fps = clip, 30.0
+    a, b = (dataclasses.replace(meshes[0], name=n) for n in ("a:b", "a_b"))
+    written = write_clip(tmp_path / f"two.{suffix}", [a, a, b], fps)
+    assert len(set(written)) == len(written) and all(p.exists() for p in written)
+    if suffix == "npz":
+        with np.load(written[0], allow_pickle=False) as file:
+            assert {"a:b_positions", "a:b_2_positions", "a_b_3_positions"} <= set(file.files)
+    elif suffix != "glb":
+        assert len([p for p in written if p.suffix == f".{suffix}"]) % 3 == 0
+
+
+@pytest.mark.parametrize("suffix", ["npz", "obj", "glb", "usda", "pc2"])
+def test_clips_that_are_none_are_refused(tmp_path, clip, suffix):
+    meshes, fps = clip, 30.0
+    path = tmp_path / f"a.{suffix}"
+    for rate in (0.0, -30.0, float("nan")):
+        with pytest.raises(FormatError, match="fps"):
+            write_clip(path, meshes, rate)
+    short = dataclasses.replace(meshes[0], positions=meshes[0].positions[:1])
+    for bad in (
+        [],
+        [meshes[0], short],
+        [dataclasses.replace(short, positions=short.positions[:0])],
+    ):
+        with pytest.raises(FormatError, match="frames"):
+            write_clip(path, bad, fps)
+    assert not list(tmp_path.iterdir())

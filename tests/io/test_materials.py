@@ -8,6 +8,7 @@ from scipy.spatial import KDTree
 
 from physxnet_jax import dress, fit_garment, template
 from physxnet_jax.garment import load_garment
+from physxnet_jax.geometry import Material, Polygons
 from physxnet_jax.io import AnimatedMesh, read_mesh, read_obj, write_clip, write_obj
 
 COLOURS = {"Denim blue": (0.1, 0.2, 0.6), "Red": (0.8, 0.1, 0.1)}
@@ -224,3 +225,24 @@ def test_faces_without_a_material_stay_without_one(quilted, tmp_path):
     names = [back.materials[k].name for k in back.material]
     wanted = ["default" if k < 0 else mesh.polygons.materials[k].name for k in bare]
     assert names == wanted and len(set(names)) == 3
+
+
+def test_materials_of_one_name_keep_their_colours_and_lines_stay_whole(tmp_path):
+    """Names from other formats may repeat, and may hold line ends."""
+    mesh = template("bottom").mesh
+    x, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    names, colours = ("mat", "mat", "red\nv 0 0 0\nf 1 2 3"), ((1, 0, 0), (0, 0, 1), (0, 1, 0))
+    drawn = Polygons(
+        np.full(len(faces), 3, np.int32),
+        faces.reshape(-1),
+        None,
+        (np.arange(len(faces)) % 3).astype(np.int32),
+        tuple(Material(n, tuple(map(float, c))) for n, c in zip(names, colours, strict=True)),
+    )
+    clip = [AnimatedMesh("a", x[None].astype(np.float32), faces.astype(np.int32), polygons=drawn)]
+    write_clip(tmp_path / "c.obj", clip, 30.0)
+    again = read_obj(tmp_path / "c_a_0000.obj")
+    assert len(again.vertices) == len(x) and len(again.faces) == len(faces)
+    kept = again.polygons
+    found = [kept.materials[k].colour for k in kept.material[:3]]
+    np.testing.assert_allclose(found, colours, atol=1e-6)

@@ -14,3 +14,7 @@ class PlainConsole(Console):
     def render_str(self, text: str, **options: Any) -> Text:
         """As `Console.render_str`, of the visible text."""
         return super().render_str(visible(text), **options)
+
+    def on_broken_pipe(self) -> None:
+        """The caller decides what a closed pipe means, and the exit code."""
+        raise

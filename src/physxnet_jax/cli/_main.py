@@ -86,10 +86,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     start()
     words = list(sys.argv[1:] if arguments is None else arguments)
-    if not words or words[0] in ("-h", "--help"):
-        print_help(PlainConsole(highlight=False))
-        return 0 if words else 2
-    command = parse(words)
+    try:
+        if not words or words[0] in ("-h", "--help"):
+            print_help(PlainConsole(highlight=False))
+            return 0 if words else 2
+        command = parse(words)
+    except BrokenPipeError:
+        return _closed_pipe()
     # Paths and names may contain brackets.
     console = PlainConsole(stderr=False, markup=False)
     errors = PlainConsole(stderr=True, soft_wrap=True)
@@ -98,9 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             add_inputs(*_named_files(command))
             return _run(command, console)
     except BrokenPipeError:
-        # The reader closed the pipe: the flush at exit must not fail again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        return _closed_pipe()
     except (PhysXNetError, OSError) as error:
         if _flag(command, "debug"):
             raise
@@ -133,6 +134,12 @@ _LESS_MEMORY = (
 )
 # Options that name what is written.
 _WRITTEN = ("out", "preview", "html", "write_scene", "errors", "contact_sheet")
+
+
+def _closed_pipe() -> int:
+    """The exit code where the reader closed the pipe; the flush at exit must not fail again."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 141
 
 
 def _named_files(value: Any) -> Iterator[str]:
@@ -202,6 +209,9 @@ def _resumes(command: object) -> bool:
 def parse(arguments: Sequence[str] | None = None) -> Any:
     """Parses a command line without running the command; exits if it is invalid."""
     words = sys.argv[1:] if arguments is None else arguments
+    if sum(w.partition("=")[0] == "--wear" for w in words) > 1:
+        sys.stderr.write("physxnet: --wear is given twice; name all garments after one.\n")
+        raise SystemExit(2)
     requested = words[0] if words else ""
     # Only the requested command needs its examples.
     kinds = [

@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from ..body import UNITS, unit_of_person
 from ..errors import FormatError
-from ..files import is_file, read_arrays
+from ..files import add_inputs, is_file, read_arrays
 from ..io import (
     GLTF_FORMATS,
     AnimatedMesh,
@@ -131,6 +131,7 @@ def read_character(
         )
     if not is_file(path):
         raise FormatError(f"{path}: no such file. Check the path.")
+    add_inputs(path)
     if motion is not None and suffix not in GLTF_FORMATS:
         raise FormatError(
             f"{path}: only rigs take another motion, from {', '.join(GLTF_FORMATS[:3])};"
@@ -264,6 +265,7 @@ def _read_cache(
         raise FormatError(
             f"{path}: a cache has only points; put the OBJ of its faces beside it, {beside.name}."
         )
+    add_inputs(beside)
     rate: float | None = None
     if path.suffix.lower() == ".pc2":
         positions = read_pc2(path)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._environment import clear_caches_if_full
 from ..body import Body, skin_points
+from ..errors import check_rate
 from ..models import apply_sampled_offsets, normalise, point_features, predict_sampled
 from ..motion import ROTATION_LENGTHS, extrapolate_history
 from ..simulation.effects import TURBULENCE_PERIOD
@@ -171,6 +172,7 @@ def clothe(
 
     Raises:
         ValueError: The clip has no frames, or its skeleton isn't the body's.
+        PhysXNetError: ``fps`` isn't a positive number.
 
     Example:
         >>> from physxnet_jax.dressing import make_dresser
@@ -182,7 +184,9 @@ def clothe(
         >>> cloth["bottom"].shape
         (2, 2726, 3)
     """
+    rotations, root = jnp.asarray(rotations), jnp.asarray(root)
     _check_pose(dresser.body, rotations, root, ("frames",))
+    check_rate(fps)
     if rotations.shape[0] == 0:
         raise ValueError("the clip has no frames; clothe needs at least one.")
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((dresser, rotations, root))):
@@ -280,12 +284,14 @@ def init_stream(
     Raises:
         ValueError: The skeleton isn't the body's, or there is no pose.
     """
+    check_rate(fps)
+    rotations, root = jnp.asarray(rotations), jnp.asarray(root)
     if rotations.ndim == 2:
         rotations, root = rotations[None], root[None]
     _check_pose(dresser.body, rotations, root, ("frames",))
     if not rotations.shape[0]:
         raise ValueError("no pose: pass the first one or two.")
-    rotations, root, _ = _hold(rotations, root)
+    rotations, root, usable = _hold(rotations, root)
     place = _on_ground(root[0])
     root = root - place[None]
     length = dresser.history_length(fps)
@@ -294,7 +300,8 @@ def init_stream(
         place=place,
         rotations=rotations[0],
         root=root[0],
-        usable=jnp.ones((length,), bool),
+        # The poses before follow from these.
+        usable=jnp.broadcast_to(jnp.all(usable), (length,)),
     )
     if dresser.predictor is None:
         return stream
@@ -337,6 +344,8 @@ def clothe_step(
     Example:
         >>> step = jax.jit(clothe_step, static_argnames="fps", donate_argnames="stream")
     """
+    check_rate(fps)
+    rotations, root = jnp.asarray(rotations), jnp.asarray(root)
     _check_pose(dresser.body, rotations, root, ())
     usable = _is_usable(rotations, root)
     rotations = jnp.where(usable, rotations, stream.rotations)

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 from jaxtyping import Array, Float, Int
 
@@ -181,6 +181,10 @@ def dress_garments(
     precision: Precision = "float32",
 ) -> Dresser:
     """`make_dresser` for garments that are already on the body."""
+    for name, value, kind in (("method", method, Predicted), ("precision", precision, Precision)):
+        if value not in get_args(kind):
+            there = ", ".join(get_args(kind))
+            raise PhysXNetError(f"No {name} '{value}' here; there are {there}.")
     inference = Inference() if inference is None else inference
     rest = body.rest_vertices(body.checked_shape(shape))
     sites = tuple(make_sites(g, rest) for g in garments)

@@ -257,9 +257,8 @@ def load_scene(path: str | pathlib.Path, *, frames: int | None = None) -> SceneF
     shape = load_body().shape(**text["shape"]) if "shape" in text else None
     places = [_resolve_path(path, g["file"]) for g in words]
     # No command may overwrite what a scene names.
-    add_inputs(
-        path, _resolve_path(path, text["motion"]), *(parse_wear(str(w)).name for w in places)
-    )
+    named = [_resolve_path(path, text["motion"]), *(parse_wear(str(w)).name for w in places)]
+    add_inputs(path, *named, *(split_part(pathlib.Path(n))[0] for n in named))
     worn, notes = resolve_garments(places, load_body(), shape)
     try:
         garments = [
@@ -372,6 +371,12 @@ def _read_scene(path: pathlib.Path) -> tuple[dict[str, Any], list[dict[str, Any]
 
 
 def _resolve_path(path: pathlib.Path, word: str) -> str | pathlib.Path:
+    def found(option: re.Match[str]) -> str:
+        file = path.parent / option[2]
+        return f"{option[1]}={file if is_file(file) else option[2]}"
+
+    # Files that a garment's options name.
+    word = re.sub(r"(?<=[:,])(fabric|made_on)=([^,]*)", found, word)
     there = path.parent / word
     # A garment's path may be followed by "#mesh" and options.
     files = (path.parent / name for name in (word, parse_wear(word).name))

@@ -81,6 +81,9 @@ class Simulation:
             raise FormatError(f"refine is {self.refine}, expected a length in metres.")
         if self.substeps is not None and self.substeps < 1:
             raise FormatError(f"substeps is {self.substeps}, expected a positive number.")
+        engines = ("xpbd", "bdf2", *EXTERNAL_ENGINES)
+        if self.engine not in engines:
+            raise FormatError(f"No engine '{self.engine}'; there are {', '.join(engines)}.")
         if self.accuracy not in PRESETS:
             raise FormatError(f"No accuracy '{self.accuracy}'; there are {', '.join(PRESETS)}.")
         options = {

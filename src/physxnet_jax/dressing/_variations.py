@@ -19,7 +19,9 @@ def with_shape(dresser: Dresser, shape: Float[Array, " shapes"]) -> Dresser:
     Garments follow the shape as in `Garment.rest_vertices`. A single garment that a network
     predicts gives the same result as `make_dresser` with the shape. With several garments, the
     clearance between layers stays that of the previous shape; in a guided simulation the skin that
-    contact compares does, see `System.reshaped`.
+    contact compares does, see `System.reshaped`. A cut of `with_cut` is given up, as it was made
+    for the shape before: change the shape first. Garments that are cut to measure follow the shape
+    as they are; `make_dresser` cuts those that are given by name anew.
 
     Args:
         dresser: From `make_dresser`.

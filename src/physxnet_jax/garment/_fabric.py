@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from ..errors import FormatError, PhysXNetError
+from ..files import add_inputs, is_file
 from ._garment import FABRICS, Fabric
 
 # A fabric has ten numbers; other files are refused unread [bytes].
@@ -35,6 +36,9 @@ def find_fabric(word: str | pathlib.Path) -> Fabric:
         raise PhysXNetError(
             f"No fabric '{word}'; there are {', '.join(FABRICS)}, and files that end in .toml."
         )
+    if not is_file(path):
+        raise FormatError(f"{path}: no such file. Check the path.")
+    add_inputs(path)
     try:
         size = path.stat().st_size
         text = path.read_text(encoding="utf-8") if size <= _MOST_BYTES else ""

@@ -7,7 +7,7 @@ import warnings
 from typing import Any
 
 from ..errors import MissingDependencyError, MotionError
-from ..files import is_file
+from ..files import add_inputs, is_file
 
 MAX_BYTES = 1_000_000_000
 """Largest file that is read [bytes]."""
@@ -28,6 +28,7 @@ def parse_gltf(path: pathlib.Path) -> Any:
         ) from error
     if not is_file(path):
         raise MotionError.at(path, None, "no such file", "Check the path")
+    add_inputs(path)
     if path.stat().st_size > MAX_BYTES:
         raise MotionError.at(path, None, "over 1 GB", "Cut the clip into shorter files")
     binary = path.read_bytes()[:4] == b"glTF"

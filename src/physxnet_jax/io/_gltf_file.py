@@ -12,7 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from ..errors import MotionError
-from ..files import is_file
+from ..files import add_inputs, is_file
 from ._frame_rate import nominal_rate
 from ._gltf_document import MAX_BYTES, declared_tree, parse_gltf
 from ._gltf_track import track_at
@@ -482,6 +482,7 @@ class GltfFile:
                 f"its buffer '{uri[:60]}' is missing or over 1 GB",
                 "Put it beside the file",
             )
+        add_inputs(file)
         return file.read_bytes()
 
     def _topological_order(self) -> list[int]:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import FormatError
-from ..files import is_file
+from ..files import add_inputs, is_file
 from ._animated_mesh import StaticMesh
 from ._obj import read_obj
 from ._source_mesh import SourceMesh, joined, named, welded
@@ -51,6 +51,7 @@ def read_mesh(path: str | pathlib.Path) -> StaticMesh:
         )
     if not is_file(path):
         raise FormatError(f"{path}: no such file. Check the path.")
+    add_inputs(path)
     if path.stat().st_size > _MAX_BYTES:
         raise FormatError(f"{path}: over 500 MB. Decimate the mesh first.")
     if suffix == ".obj":

@@ -1,6 +1,7 @@
 """Wavefront OBJ: polygons, texture coordinates, materials, several objects in a file."""
 
 import contextlib
+import itertools
 import pathlib
 import re
 from collections.abc import Sequence
@@ -9,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from ..errors import FormatError
-from ..files import atomic_write, is_file
+from ..errors import FormatError, visible
+from ..files import add_inputs, atomic_write, is_file
 from ..geometry import Material, Polygons, Texture, make_material
 from ._animated_mesh import StaticMesh
 from ._source_mesh import chosen_names
@@ -48,6 +49,7 @@ def read_obj(path: str | pathlib.Path, part: str | None = None) -> StaticMesh:
     path = pathlib.Path(path)
     if not is_file(path):
         raise FormatError(f"{path}: no such file. Check the path.")
+    add_inputs(path)
     if path.stat().st_size > _MAX_BYTES:
         raise FormatError(f"{path}: over 500 MB. Decimate the mesh first.")
     blob = path.read_bytes()
@@ -266,6 +268,7 @@ def _looks(path: pathlib.Path, libraries: list[str]) -> dict[str, _Look]:
         file = path.parent / pathlib.PurePath(library.replace("\\", "/")).name
         if not is_file(file) or file.stat().st_size > _MAX_LIBRARY:
             continue
+        add_inputs(file)
         name, colour, image, move = None, None, None, None
         for line in file.read_bytes().decode("utf-8", "replace").splitlines():
             words = line.split("#")[0].split()
@@ -351,17 +354,27 @@ def write_obj(
     words = [str(a + 1) for a in polygons.corners]
     if textured and polygons.uv_corners is not None:
         words = [f"{a}/{t + 1}" for a, t in zip(words, polygons.uv_corners, strict=True)]
-    used = -1
+    used, names = -1, _material_names(polygons.materials)
     for start, count, which in zip(
         polygons.starts, polygons.counts, polygons.material, strict=True
     ):
         if which != used:
             # Without this line, faces without a material would inherit the previous one.
-            lines.append(f"usemtl {polygons.materials[which].name if which >= 0 else _NONE}")
+            lines.append(f"usemtl {names[which] if which >= 0 else _NONE}")
         used = which
         lines.append("f " + " ".join(words[start : start + count]))
     with atomic_write(path) as part:
         part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _material_names(materials: Sequence[Material]) -> list[str]:
+    """A name of one line for each material, which no other has."""
+    out: list[str] = []
+    for m in materials:
+        name = " ".join(visible(m.name).split()) or "material"
+        same = (f"{name}_{k}" for k in itertools.count(2))
+        out.append(name if name not in out else next(n for n in same if n not in out))
+    return out
 
 
 def write_materials(path: str | pathlib.Path, materials: Sequence[Material]) -> list[pathlib.Path]:
@@ -373,8 +386,8 @@ def write_materials(path: str | pathlib.Path, materials: Sequence[Material]) -> 
     path = pathlib.Path(path)
     images = write_textures(path, [m.texture for m in materials])
     lines = []
-    for m in materials:
-        lines.append(f"newmtl {m.name}")
+    for m, name in zip(materials, _material_names(materials), strict=True):
+        lines.append(f"newmtl {name}")
         image = None if m.texture is None else images.get(m.texture)
         colour = (1.0, 1.0, 1.0) if m.colour is None and image is not None else m.colour
         if colour is not None:

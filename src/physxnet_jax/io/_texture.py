@@ -4,7 +4,7 @@ import pathlib
 import re
 from collections.abc import Iterable
 
-from ..files import atomic_write
+from ..files import add_inputs, atomic_write
 from ..geometry import Texture, make_texture
 
 _MAX_BYTES = 100_000_000
@@ -30,6 +30,7 @@ def texture_beside(file: str | pathlib.Path, name: str) -> Texture:
             image = (folder / place).resolve()
             found = image.is_relative_to(folder) and image.is_file()
             if found and image.stat().st_size <= _MAX_BYTES:
+                add_inputs(image)
                 return make_texture(name, image.read_bytes())
         # The reference may be no valid path.
         except (OSError, ValueError):

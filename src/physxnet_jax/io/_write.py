@@ -1,16 +1,18 @@
 """Writes clips in the format that the file's extension selects."""
 
 import contextlib
+import dataclasses
 import itertools
+import math
 import pathlib
 import re
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from ..errors import FormatError
-from ..files import atomic_write, check_writable
+from ..files import atomic_write, check_replaceable, check_writable
 from ..frames import in_chunks
 from ._animated_mesh import AnimatedMesh
 from ._gltf import check_gltf, write_gltf
@@ -84,6 +86,7 @@ def write_clip(
     ``STEM_NAME.pc2`` and ``STEM_NAME.obj``. ``.obj``: a file for each mesh and frame,
     ``STEM_NAME_0000.obj``; files with the next numbers, left by a longer clip, are removed.
     If a mesh has materials, ``STEM_NAME.mtl`` and their images are written beside OBJ files.
+    A number is added to names that several meshes have.
 
     Args:
         path: Output path; its extension selects the format.
@@ -95,11 +98,18 @@ def write_clip(
         The files written.
 
     Raises:
-        FormatError: The extension is unknown, or there are too many frames for glTF.
+        FormatError: The extension is unknown, there are too many frames for glTF, meshes have
+            different numbers of frames or none, or ``fps`` isn't positive.
         DiskFullError: It doesn't fit on the disk.
         MissingDependencyError: A library that the format needs isn't installed.
     """
     suffix = pathlib.Path(path).suffix.lower()
+    if not meshes or len({len(m.positions) for m in meshes}) > 1 or not len(meshes[0].positions):
+        counts = [len(m.positions) for m in meshes]
+        raise FormatError(f"{path}: meshes of {counts} frames, expected the same number.")
+    if not (isinstance(fps, int | float | np.floating) and math.isfinite(fps) and fps > 0):
+        raise FormatError(f"{path}: fps is {fps!r}, expected a positive number.")
+    meshes = _named_apart(meshes)
     # In USD a skinned body has no positions.
     moving = [m for m in meshes if not (suffix.startswith(".usd") and m.skinning is not None)]
     frames = len(meshes[0].positions) if meshes else None
@@ -113,20 +123,39 @@ def write_clip(
         write = write_gltf if suffix == ".glb" else write_html
         write(path, meshes, fps)
         return [path]
+    # Files left by a longer clip would be taken for the rest of this one.
+    left = [p for m in meshes for p in _left(path, m)] if suffix == ".obj" else []
+    for p in left:
+        check_replaceable(p)
     written: list[pathlib.Path] = []
     with contextlib.ExitStack() as stack:
         # All files appear at the end, or none.
         for m in meshes:
             written += _write_parts(path, suffix, m, fps, stack)
-    if suffix == ".obj":
-        for m in meshes:
-            # Files left by a longer clip would be taken for the rest of this one.
-            for k in itertools.count(len(m.positions)):
-                left = path.with_name(f"{_stem(path, m)}_{k:04d}.obj")
-                if not left.is_file():
-                    break
-                left.unlink()
+    for p in left:
+        p.unlink()
     return written
+
+
+def _named_apart(meshes: Sequence[AnimatedMesh]) -> list[AnimatedMesh]:
+    """The meshes; those whose names give the same file names have a number too."""
+    out: list[AnimatedMesh] = []
+    taken: set[str] = set()
+    for m in meshes:
+        same = (f"{m.name}_{k}" for k in itertools.count(2))
+        name = next(n for n in itertools.chain([m.name], same) if _file_name(n) not in taken)
+        taken.add(_file_name(name))
+        out.append(m if name == m.name else dataclasses.replace(m, name=name))
+    return out
+
+
+def _left(path: pathlib.Path, m: AnimatedMesh) -> Iterator[pathlib.Path]:
+    """Files of a mesh's frames after its last."""
+    for k in itertools.count(len(m.positions)):
+        p = path.with_name(f"{_stem(path, m)}_{k:04d}.obj")
+        if not p.is_file():
+            return
+        yield p
 
 
 def _write_npz(path: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -> None:
@@ -154,7 +183,12 @@ def _write_npz(path: pathlib.Path, meshes: Sequence[AnimatedMesh], fps: float) -
 
 
 def _stem(path: pathlib.Path, mesh: AnimatedMesh) -> str:
-    return f"{path.stem}_{_INVALID.sub('_', mesh.name)}"
+    return f"{path.stem}_{_file_name(mesh.name)}"
+
+
+def _file_name(name: str) -> str:
+    # Names of files that aren't UTF-8 have parts that can't be written as text.
+    return _INVALID.sub("_", name.encode("utf-8", "replace").decode())
 
 
 def _write_parts(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ..body import Body, load_body
 from ..errors import MotionError, check_type
-from ..files import atomic_write, is_file, read_arrays
+from ..files import add_inputs, atomic_write, is_file, read_arrays
 from ..io import GLTF_FORMATS
 from ._amass import AMASS_ARRAYS, amass_clip, is_amass
 from ._asf_amc import read_amc
@@ -178,6 +178,7 @@ def _read_npz(
 ) -> Motion | SourceClip:
     if not is_file(path):
         raise MotionError.at(path, None, "no such file", "Check the path")
+    add_inputs(path)
     try:
         if path.suffix.lower() == ".pkl":
             data = read_pickled_arrays(path, AMASS_ARRAYS)

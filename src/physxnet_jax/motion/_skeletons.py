@@ -6,6 +6,7 @@ import tomllib
 
 from ..body import load_body
 from ..errors import MotionError
+from ..files import add_inputs, is_file
 from ._source import SourceClip
 
 _SIDES = (("Left", "l", "L"), ("Right", "r", "R"))
@@ -221,6 +222,9 @@ def read_joint_map(path: str | pathlib.Path) -> dict[str, str]:
         MotionError: Not TOML, values that aren't names, or joints that the body lacks.
     """
     path = pathlib.Path(path)
+    if not is_file(path):
+        raise MotionError.at(path, None, "no such file", "Check the path")
+    add_inputs(path)
     try:
         if path.stat().st_size > 1_000_000:
             raise MotionError.at(path, None, "over 1 MB", "A joint map is a short list of names")

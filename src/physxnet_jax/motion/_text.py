@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..errors import MotionError
-from ..files import is_file
+from ..files import add_inputs, is_file
 
 # No length or angle is larger, in any unit.
 _LARGEST = 1e12
@@ -24,6 +24,7 @@ def read_lines(path: pathlib.Path, kind: str) -> list[str]:
     """
     if not is_file(path):
         raise MotionError.at(path, None, "no such file", "Check the path")
+    add_inputs(path)
     if path.stat().st_size > _MAX_BYTES:
         raise MotionError.at(path, None, "over 500 MB of text", "Cut the clip into shorter files")
     blob = path.read_bytes()

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from .._environment import clear_caches_if_full
 from ..body import Body
 from ..devices import make_mesh
-from ..errors import SimulationError, check_type
+from ..errors import SimulationError, check_rate, check_type
 from ..files import claims
 from ..frames import FrameStore
 from ..motion import Motion, animate, ground_point
@@ -129,6 +129,18 @@ def simulate(
 
 def _check_motion(motion: object) -> None:
     check_type(motion, Motion, "Pass a Motion, as load_motion('walk') gives.")
+    assert isinstance(motion, Motion)
+    check_rate(motion.fps)
+    q, p = (np.asarray(x) for x in (motion.rotations, motion.root))
+    if len(q) != len(p) or not len(q):
+        raise SimulationError(f"The motion has {len(q)} rotations and {len(p)} places of the root.")
+    turns = np.isfinite(q).all(axis=2) & (np.abs(q).max(axis=2) > 1e-6)
+    bad = ~np.isfinite(p).all(axis=1) | ~turns.all(axis=1)
+    if bad.any():
+        raise SimulationError(
+            f"Frame {int(bad.argmax())} of the motion isn't finite, or states no rotation:"
+            " make_motion names what is wrong."
+        )
 
 
 @claims("resume")

@@ -170,6 +170,7 @@ def prepare_scene(scene: Scene) -> PreparedScene:
             f"An effect is listed twice: {[k.__name__ for k in kinds]}. List each only once."
         )
     body = load_body() if scene.body is None else scene.body
+    body.checked_shape(scene.shape)
     # `make_system` moves the tables to the device.
     with on_processor():
         shape = body.default_shape() if scene.shape is None else scene.shape

@@ -3,7 +3,7 @@
 import dataclasses
 from typing import Literal
 
-from ..errors import check_counts, check_numbers
+from ..errors import check_choices, check_counts, check_numbers
 from ..models import ModelConfig
 
 
@@ -98,6 +98,7 @@ class TrainConfig:
     max_skipped: int = 20
 
     def __post_init__(self) -> None:
+        check_choices(self, "optimizer", "schedule", "loss")
         check_counts(self, "batch", "discriminator_width", "validate_every")
         check_counts(self, "patience", "checkpoint_every", "frames_in_memory", "max_skipped")
         check_numbers(self, "epochs", "learning_rate", "discriminator_rate", "muon_learning_rate")
