@@ -2,6 +2,7 @@
 
 import base64
 import json
+import os
 
 import numpy as np
 import pytest
@@ -11,7 +12,14 @@ from scipy.spatial import KDTree
 from physxnet_jax.dressing import inspect_garment
 from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.garment import load_garment, template
-from physxnet_jax.io import GARMENT_FORMATS, AnimatedMesh, read_mesh, write_clip, write_obj
+from physxnet_jax.io import (
+    GARMENT_FORMATS,
+    AnimatedMesh,
+    mesh_name,
+    read_mesh,
+    write_clip,
+    write_obj,
+)
 
 
 @pytest.fixture(scope="module")
@@ -226,3 +234,9 @@ def test_damaged_packages_are_refused(trousers, tmp_path):
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(FormatError, match=r"trousers\.usdz"):
         read_mesh(path)
+
+
+def test_names_of_files_that_are_not_utf8_can_be_written():
+    for path in (os.fsdecode(b"g/\xff\xfe.obj"), os.fsdecode(b"g/a.glb#\xff")):
+        assert mesh_name(path).encode("utf-8")
+    assert mesh_name("g/m\u00e4ntel.obj") == "m\u00e4ntel"

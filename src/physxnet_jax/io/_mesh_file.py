@@ -23,7 +23,9 @@ _MAX_COORDINATE = 1e18
 def mesh_name(path: str | pathlib.Path) -> str:
     """The name of a file's mesh: ``coat``, or ``coat_sleeves`` for one of several."""
     file, part = split_part(path)
-    return file.stem if part is None else f"{file.stem}_{part}"
+    name = file.stem if part is None else f"{file.stem}_{part}"
+    # What isn't UTF-8 in a file's name can't be written as text.
+    return name.encode("utf-8", "replace").decode()
 
 
 def read_mesh(path: str | pathlib.Path) -> StaticMesh:
