@@ -227,7 +227,6 @@ def init_guided(
         translations: World translations of joints in the frame before [m].
     """
     dtype = scene.system.inverse_mass.dtype
-    rotations, translations = rotations.astype(dtype), translations.astype(dtype)
     zero = jnp.zeros((scene.parts[-1], 3, 1), dtype)
     skin = skin_effects(scene.system, rotations[None], translations[None])
     return GuidedState(
@@ -277,9 +276,6 @@ def advance_guided(
         fps: Frames per second.
     """
     solver, system = scene.solver.at_rate(fps), scene.system
-    dtype = system.inverse_mass.dtype
-    rotations, translations = rotations.astype(dtype), translations.astype(dtype)
-    predicted = tuple(x.astype(dtype) for x in predicted)
     if fps != _RATE:
         known, rate = (s.substeps * f for s, f in ((scene.solver, _RATE), (solver, fps)))
         system = _softened(system, _softness(rate) / _softness(known))
