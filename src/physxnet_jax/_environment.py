@@ -147,8 +147,8 @@ def compile_whole_programs(
 ) -> None:
     """Makes XLA compile a program in few parts on processors; call it before jax is imported.
 
-    By default each fused loop is a library of its own. Programs of hundreds of loops then take
-    twice as long to compile, and more memory.
+    By default each fused loop is a library of its own: programs of hundreds of loops then take
+    longer to compile, and more memory.
 
     Args:
         environment: Environment variables to change; those of this process by default. Flags that
@@ -171,7 +171,7 @@ def share_one_heap() -> None:
     """Makes all threads allocate from one heap; call it before they are started.
 
     The allocator of glibc keeps a heap for each of many threads, and what one of them has freed is
-    of no use to the others: a fifth of all memory. Others have no such setting.
+    of no use to the others. Other allocators have no such setting.
     """
     with contextlib.suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).mallopt(_M_ARENA_MAX, 1)

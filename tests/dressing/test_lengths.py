@@ -91,7 +91,7 @@ print(np.median(times[:200]), np.median(times[-200:]))
 
 @pytest.mark.nightly
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-@pytest.mark.xfail(strict=True, reason="docs/reliability.md: 20,000 maps and 1.9 GB half-way")
+@pytest.mark.xfail(strict=True, reason="a program for each length, see docs/reliability.md")
 def test_a_thousand_lengths_and_fifty_garments_end_as_they_began():
     out = subprocess.run([sys.executable, "-c", SOAK], capture_output=True, text=True, check=True)
     (maps, gigabytes), _ = (map(float, line.split()) for line in out.stdout.splitlines()[-2:])

@@ -11,7 +11,7 @@ import trimesh
 from hypothesis import given, settings, strategies as st
 
 from physxnet_jax.cli import main
-from physxnet_jax.errors import FormatError
+from physxnet_jax.errors import FormatError, PhysXNetError
 from physxnet_jax.io import AnimatedMesh, read_mdd, write_clip, write_mdd
 from physxnet_jax.io._gltf import MAX_FRAMES
 
@@ -219,7 +219,7 @@ def test_clips_that_are_none_are_refused(tmp_path, clip, suffix):
     meshes, fps = clip, 30.0
     path = tmp_path / f"a.{suffix}"
     for rate in (0.0, -30.0, float("nan")):
-        with pytest.raises(FormatError, match="fps"):
+        with pytest.raises(PhysXNetError, match=r"fps is .*, expected a positive number"):
             write_clip(path, meshes, rate)
     short = dataclasses.replace(meshes[0], positions=meshes[0].positions[:1])
     for bad in (

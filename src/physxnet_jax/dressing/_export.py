@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import pathlib
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from jax import export
 
 from ..data import CARD
-from ..errors import MissingDependencyError, PhysXNetError
+from ..errors import MissingDependencyError, PhysXNetError, check_rate
 from ..files import atomic_write
 from ..models import read_card
 from ._clothe import clothe
@@ -78,8 +77,7 @@ def export_dresser(
         MissingDependencyError: flatbuffers isn't installed, which jax needs for exports.
         PhysXNetError: A platform is unknown, or the frame rate isn't positive.
     """
-    if not (math.isfinite(fps) and fps > 0):
-        raise PhysXNetError(f"fps is {fps}, expected a positive number.")
+    check_rate(fps)
     unknown = set(platforms) - set(_PLATFORMS)
     if unknown or not platforms:
         raise PhysXNetError(

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import itertools
-import math
 import pathlib
 import re
 import zipfile
@@ -11,7 +10,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ..errors import FormatError
+from ..errors import FormatError, check_rate
 from ..files import atomic_write, check_replaceable, check_writable
 from ..frames import in_chunks
 from ._animated_mesh import AnimatedMesh
@@ -98,8 +97,9 @@ def write_clip(
         The files written.
 
     Raises:
-        FormatError: The extension is unknown, there are too many frames for glTF, meshes have
-            different numbers of frames or none, or ``fps`` isn't positive.
+        FormatError: The extension is unknown, there are too many frames for glTF, or meshes have
+            different numbers of frames or none.
+        PhysXNetError: ``fps`` isn't a positive number.
         DiskFullError: It doesn't fit on the disk.
         MissingDependencyError: A library that the format needs isn't installed.
     """
@@ -107,12 +107,11 @@ def write_clip(
     if not meshes or len({len(m.positions) for m in meshes}) > 1 or not len(meshes[0].positions):
         counts = [len(m.positions) for m in meshes]
         raise FormatError(f"{path}: meshes of {counts} frames, expected the same number.")
-    if not (isinstance(fps, int | float | np.floating) and math.isfinite(fps) and fps > 0):
-        raise FormatError(f"{path}: fps is {fps!r}, expected a positive number.")
+    check_rate(fps)
     meshes = _named_apart(meshes)
     # In USD a skinned body has no positions.
     moving = [m for m in meshes if not (suffix.startswith(".usd") and m.skinning is not None)]
-    frames = len(meshes[0].positions) if meshes else None
+    frames = len(meshes[0].positions)
     path = check_output(path, frames, sum(m.positions.shape[1] for m in moving))
     if suffix.startswith(".usd"):
         return write_usd(path, meshes, fps, velocities=velocities)
@@ -187,8 +186,7 @@ def _stem(path: pathlib.Path, mesh: AnimatedMesh) -> str:
 
 
 def _file_name(name: str) -> str:
-    # Names of files that aren't UTF-8 have parts that can't be written as text.
-    return _INVALID.sub("_", name.encode("utf-8", "replace").decode())
+    return _INVALID.sub("_", name)
 
 
 def _write_parts(

@@ -35,7 +35,7 @@ class Air(Effect):
         gust: Amplitude of the gusts, relative to the mean wind [1].
         period: Period of the gusts [s].
         turbulence: Root mean square of the turbulent velocity [m/s].
-        eddy: Size of the largest eddies [m]; turbulence repeats every `TURBULENCE_PERIOD`.
+        eddy: Size of the largest eddies [m]; turbulence repeats every 16 m.
         seed: Random seed of the turbulence.
         density: Density of the air [kg/m^3].
         normal: Drag coefficient normal to the cloth [1].
