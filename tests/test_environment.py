@@ -17,6 +17,7 @@ from physxnet_jax._environment import (
     compile_whole_programs,
     enable_compilation_cache,
     uses_compilation_cache,
+    uses_few_parts,
 )
 from physxnet_jax.files import atomic_write
 
@@ -125,9 +126,18 @@ def test_own_flags_of_xla_are_kept_and_unknown_versions_left_alone():
     assert not untried
 
 
+def test_commands_that_compute_for_long_compile_in_many_parts():
+    assert uses_few_parts(["physxnet", "dress", "walk", "--wear", "top"])
+    assert uses_few_parts(["physxnet.exe", "inspect", "coat.obj"])
+    for words in ("simulate walk", "view", "train", "bench net", "dress walk --method simulate"):
+        assert not uses_few_parts(["physxnet", *words.split()])
+    assert not uses_few_parts(["physxnet", "dress", "walk", "--method=simulate"])
+    assert not uses_few_parts(["physxnet"]) and not uses_few_parts(["other", "dress"])
+
+
 FLAGS = """
 import os, sys
-sys.argv = [sys.argv[1]]
+sys.argv = [sys.argv[1], "dress"]
 import physxnet_jax
 import jax.numpy as jnp
 # XLA would end the process at a flag that it doesn't know.

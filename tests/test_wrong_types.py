@@ -30,6 +30,11 @@ for call in (
     lambda: px.make_dresser(["top"], method="simulate"),
     lambda: px.make_dresser(["top"], precision="float64"),
     lambda: px.Simulation(engine="bdf"),
+    lambda: px.Simulation(substeps=1.5),
+    lambda: px.Simulation(wind=3.0),
+    lambda: px.Simulation(floor="low"),
+    lambda: px.Simulation(self_contact="no"),
+    lambda: px.Inference(tta="no"),
     lambda: px.clothe(bare, walk.rotations, walk.root, "30"),
     lambda: px.simulate(px.Scene((top,)), px.Motion(walk.rotations, walk.root[:3], 30.0)),
     lambda: px.simulate(px.Scene((top,)), px.Motion(0 * walk.rotations, walk.root, 30.0)),
@@ -47,10 +52,12 @@ for call in (
 def test_errors_say_what_to_pass():
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, timeout=300)
     lines = done.stdout.splitlines()
-    assert done.returncode == 0 and len(lines) == 17, done.stdout + done.stderr[-2000:]
+    assert done.returncode == 0 and len(lines) == 22, done.stdout + done.stderr[-2000:]
     advice = ["A motion is", "A motion is", "a Scene", "a Scene", "a Motion", "a tuple", "garments"]
     advice += ["a whole number", "a number of seconds"]
-    advice += ["No method", "No precision", "No engine", "fps is '30'", "3 places of the root"]
+    advice += ["No method", "No precision", "No engine", "substeps is 1.5", "wind is 3.0"]
+    advice += ["height is 'low'", "self_contact is 'no'", "tta is 'no'", "fps is '30'"]
+    advice += ["3 places of the root"]
     advice += ["no rotation", "fps is -30.0", "limits"]
     assert all(some in line for some, line in zip(advice, lines, strict=True))
 

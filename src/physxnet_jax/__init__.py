@@ -17,6 +17,7 @@ from ._environment import (
     is_command as _is_command,
     share_one_heap as _share_one_heap,
     uses_compilation_cache as _uses_compilation_cache,
+    uses_few_parts as _uses_few_parts,
 )
 from ._version import __version__ as __version__
 
@@ -25,6 +26,7 @@ if _uses_compilation_cache(_sys.argv):
     _enable_compilation_cache()
 if _is_command(_sys.argv):
     _share_one_heap()
+if _uses_few_parts(_sys.argv):
     _compile_whole_programs()
 
 # `physxnet doctor` must be able to report what is wrong.

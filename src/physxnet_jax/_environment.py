@@ -9,7 +9,7 @@ import os
 import pathlib
 import platform
 import sys
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Mapping, MutableMapping, Sequence
 
 from .errors import BrokenInstallError
 
@@ -19,8 +19,9 @@ BROKEN_JAXLIB = {
 }
 _MAPS_ALLOWED = pathlib.Path("/proc/sys/vm/max_map_count")
 _MAPS_HELD = pathlib.Path("/proc/self/maps")
-_FEW_PARTS = ("--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=2")
+_FEW_PARTS = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 2}
 _TRIED = ("0.10.1",)
+_BRIEF = {"dress", "demo", "inspect", "fit", "tailor", "export", "export-rest"}
 # Of glibc's malloc.h.
 _M_ARENA_MAX = -8
 _FLAG = "xla_cpu_experimental_ynn_fusion_type="
@@ -74,6 +75,16 @@ def uses_compilation_cache(words: Sequence[str]) -> bool:
     Commands that measure compilation must compile.
     """
     return is_command(words) and words[1:2] not in (["bench"], ["effects"])
+
+
+def uses_few_parts(words: Sequence[str]) -> bool:
+    """Whether a command line is a `physxnet` command that compiles for longer than it computes.
+
+    What is compiled in few parts runs up to twice as long: nothing for commands that simulate,
+    train, show cloth live, or measure times.
+    """
+    brief = is_command(words) and not _BRIEF.isdisjoint(words[1:2])
+    return brief and not any(w.rpartition("=")[2] == "simulate" for w in words)
 
 
 def is_command(words: Sequence[str]) -> bool:
@@ -157,14 +168,21 @@ def compile_whole_programs(
             is changed for versions on which this wasn't tried.
     """
     env = os.environ if environment is None else environment
+    parts = few_parts(env, version)
+    flags = [f"--{name}={str(value).lower()}" for name, value in (parts or {}).items()]
+    if flags:
+        env["XLA_FLAGS"] = " ".join([*env.get("XLA_FLAGS", "").split(), *flags])
+
+
+def few_parts(
+    environment: Mapping[str, str] | None = None, version: str | None = None
+) -> dict[str, bool | int] | None:
+    """Options of `jax.jit` as of `compile_whole_programs`; None if there are none to set."""
+    env = os.environ if environment is None else environment
     version = importlib.metadata.version("jaxlib") if version is None else version
-    if version not in _TRIED:
-        return
-    flags = env.get("XLA_FLAGS", "").split()
-    known = {f.partition("=")[0] for f in flags}
-    env["XLA_FLAGS"] = " ".join(
-        [*flags, *(f for f in _FEW_PARTS if f.partition("=")[0] not in known)]
-    )
+    known = {f.partition("=")[0] for f in env.get("XLA_FLAGS", "").split()}
+    parts = {k: v for k, v in _FEW_PARTS.items() if f"--{k}" not in known}
+    return parts or None if version in _TRIED else None
 
 
 def share_one_heap() -> None:

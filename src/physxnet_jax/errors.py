@@ -1,5 +1,6 @@
 """Exceptions whose messages state what was found, what was expected and how to fix it."""
 
+import functools
 import math
 import numbers
 import typing
@@ -79,7 +80,7 @@ class BrokenInstallError(PhysXNetError, RuntimeError):
 
 
 def check_numbers(owner: object, *names: str, zero: bool = False) -> None:
-    """Checks that attributes of a settings object are finite and positive; skips None.
+    """Checks that attributes of a settings object are finite and positive, or None if they may be.
 
     Args:
         owner: The settings object.
@@ -91,12 +92,40 @@ def check_numbers(owner: object, *names: str, zero: bool = False) -> None:
     """
     for name in names:
         value = getattr(owner, name)
-        if value is None:
+        if value is None and type(None) in typing.get_args(_hints(type(owner)).get(name)):
             continue
-        number = isinstance(value, numbers.Real) and math.isfinite(value)
-        if not number or value < 0 or (value == 0 and not zero):
+        number = isinstance(value, numbers.Real) and not isinstance(value, bool)
+        x = float(typing.cast(typing.Any, value)) if number else math.nan
+        if not 0.0 <= x < math.inf or (x == 0.0 and not zero):
             wanted = "a number of at least 0" if zero else "a positive number"
             raise ValueError(f"{name} is {value}, expected {wanted}")
+
+
+def check_flags(owner: object, *names: str) -> None:
+    """Checks that attributes of a settings object are True or False.
+
+    Raises:
+        ValueError: An attribute is something else; the message names it and its value.
+    """
+    for name in names:
+        value = getattr(owner, name)
+        if not isinstance(value, bool):
+            raise ValueError(f"{name} is {value!r}, expected True or False")
+
+
+def check_vector(owner: object, name: str) -> None:
+    """Checks that an attribute of a settings object is three finite numbers.
+
+    Raises:
+        ValueError: It isn't; the message names it and its value.
+    """
+    value = getattr(owner, name)
+    try:
+        finite = [math.isfinite(x) for x in value]
+    except TypeError:
+        finite = []
+    if finite != [True] * 3:
+        raise ValueError(f"{name} is {value!r}, expected three finite numbers")
 
 
 def check_counts(owner: object, *names: str) -> None:
@@ -128,11 +157,16 @@ def check_choices(owner: object, *names: str) -> None:
     Raises:
         ValueError: An attribute is something else; the message names it and the choices.
     """
-    hints = typing.get_type_hints(type(owner))
+    hints = _hints(type(owner))
     for name in names:
         value, there = getattr(owner, name), typing.get_args(hints[name])
         if value not in there:
             raise ValueError(f"{name} is {value!r}; there are {', '.join(map(str, there))}.")
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, typing.Any]:
+    return typing.get_type_hints(kind)
 
 
 def check_type(value: object, kinds: type | tuple[type, ...], advice: str) -> None:
@@ -161,6 +195,8 @@ __all__ = [
     "SimulationError",
     "WeightsError",
     "check_counts",
+    "check_flags",
+    "check_vector",
     "check_numbers",
     "check_type",
     "visible",

@@ -318,6 +318,8 @@ def test_other_body_shapes_stand_on_the_floor(tmp_path):
         (["--animation", "Run"], "one glTF file"),
         (["--camera", "front"], "add --preview FILE"),
         (["--preview", "a.png", "--background", "mauve"], "no background 'mauve'"),
+        (["-o", "a.npz", "--velocities"], "--velocities is for USD"),
+        (["--method", "lbs", "--strict"], "--strict is for cloth that is simulated"),
         (["--start", "9"], "start is 9.0 s, but walk lasts from 0 to 4.00 s"),
         (["--start", "-1"], "start is -1.0 s"),
         (["-o", "/proc/x.npz"], "nothing can be written there"),

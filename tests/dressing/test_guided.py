@@ -245,7 +245,7 @@ def test_options_that_it_has_not_are_refused(guided):
             make_dresser(
                 ["bottom"], method="guided", inference=NANO, simulation=Simulation(**options)
             )
-    with pytest.raises(FormatError, match="positive"):
+    with pytest.raises(FormatError, match="at least 1"):
         Simulation(substeps=0)
     assert guided.strain is None and guided.colliders is None and guided.layers is None
 

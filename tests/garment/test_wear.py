@@ -39,6 +39,8 @@ def test_words_are_parsed(word, expected):
         ("a.obj:as=hat", "one of top, bottom, dress"),
         ("top:fabric=tin", "there are cotton"),
         ("top:ease=0.1", "there are as, fabric"),
+        ("bottom:unit=cm", "there are as, fabric"),
+        ("dress:made_on=avatar.obj", "there are as, fabric"),
         ("tee:as=top", "there are fabric, hold, ease"),
         ("tee:ease=wide", "expected metres, as in ease=0.1"),
     ],

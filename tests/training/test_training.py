@@ -96,6 +96,13 @@ def test_losses_match_closed_forms():
         hidden = distance(predicted.at[:, 2].set(99.0), target, valid, jnp.array([1.0, 0.0]))
         assert float(hidden) == 1.0
 
+        def of(x, distance=distance):
+            return distance(x, target, valid, jnp.array([1.0, 0.0]))
+
+        broken = predicted.at[:, 2].set(jnp.nan).at[1].set(jnp.inf)
+        assert float(of(broken)) == 1.0
+        assert np.isfinite(jax.grad(of)(broken)).all()
+
 
 @pytest.mark.nightly
 def test_resumed_training_is_bitwise_equal_to_uninterrupted_training(tmp_path):

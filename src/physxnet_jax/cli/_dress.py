@@ -79,7 +79,7 @@ def run_dress(command: Dress, console: Console, still: pathlib.Path | None = Non
     check_body(command.person, command.source)
     output = command.output
     pictures = [p for p in (output.preview, still) if p is not None]
-    _check_files(output.out, pictures, command.picture, console)
+    _check_files(output, pictures, command.picture, console)
     with progress_bars(console, lines=command.terminal.progress) as progress:
         selected = choose(command, progress)
         options: dict[str, Any] = {
@@ -122,7 +122,7 @@ def run_simulate(command: Simulate, console: Console) -> int:
     check_body(command.person, command.source)
     output = command.output
     pictures = [] if output.preview is None else [output.preview]
-    _check_files(output.out, pictures, command.picture, console)
+    _check_files(output, pictures, command.picture, console)
     with progress_bars(console, lines=command.terminal.progress) as progress:
         if is_scene_file(command.scene):
             job = _scene_job(command)
@@ -375,7 +375,7 @@ def _keeps_rig(person: Character, output: Output) -> bool:
 
 
 def _check_files(
-    out: pathlib.Path | None,
+    output: Output,
     pictures: list[pathlib.Path],
     look: PreviewOptions,
     console: Console,
@@ -383,6 +383,11 @@ def _check_files(
     """Checks before the computation that all files can be written."""
     if not pictures and changed(look):
         raise PhysXNetError(f"{changed(look)[0]} is for pictures: add --preview FILE.")
+    out = output.out
+    if output.velocities and (out is None or not out.suffix.lower().startswith(".usd")):
+        raise PhysXNetError(
+            "--velocities is for USD: write a .usdc, .usd or .usda, or leave it out."
+        )
     if out is not None:
         check_output(out)
     for picture in pictures:
@@ -401,6 +406,10 @@ def _check_method(command: Dress) -> None:
         )
     if command.budget_ms is not None and command.max_error_mm is not None:
         raise PhysXNetError("Give either a time (--budget-ms) or an error (--max-error-mm).")
+    if command.output.strict and command.method in ("network", "lbs"):
+        raise PhysXNetError(
+            f"--strict is for cloth that is simulated: {command.method} keeps it on."
+        )
     check_simulates(command.method, command.simulation, command.outfit, command.inference.weights)
     if command.method in ("network", "guided"):
         # Before motion and garments are loaded.

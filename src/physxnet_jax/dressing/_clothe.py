@@ -2,7 +2,8 @@
 
 import dataclasses
 import functools
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator, Mapping, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -11,10 +12,11 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float
 
 from .._environment import clear_caches_if_full
+from .._programs import bounded_jit
 from ..body import Body, skin_points
 from ..errors import check_rate
 from ..models import apply_sampled_offsets, normalise, point_features, predict_sampled
-from ..motion import ROTATION_LENGTHS, extrapolate_history
+from ..motion import BLOCK, ROTATION_LENGTHS, extrapolate_history, pose_transforms
 from ..simulation.effects import TURBULENCE_PERIOD
 from ..typing import pytree
 from ._dresser import Dresser
@@ -156,9 +158,9 @@ def clothe(
 
     Poses before frame 0 are extrapolated, see `extrapolate_history`.
 
-    Outside of such transformations the clip is padded to one of a few lengths, so that clips of
-    any lengths share a few compiled programs. Within your own `jax.jit` each length is a program:
-    pass what `pad_frames` makes, and cut the result.
+    Outside of such transformations the clip is computed in blocks of 16 frames, so that
+    clips of any lengths share a few compiled programs. Within your own `jax.jit` each length is a
+    program: pass what `pad_frames` makes, and cut the result.
 
     Args:
         dresser: From `make_dresser`.
@@ -191,10 +193,7 @@ def clothe(
         raise ValueError("the clip has no frames; clothe needs at least one.")
     if any(isinstance(x, Tracer) for x in jax.tree.leaves((dresser, rotations, root))):
         return _clothe(dresser, rotations, root, fps)
-    clear_caches_if_full()
-    padded = pad_frames(rotations, root)
-    found = _clothe_jitted(dresser, *padded, fps)
-    return jax.tree.map(lambda x: _cut(x, rotations.shape[0]), found)
+    return _clothe_blocks(dresser, rotations, root, fps)
 
 
 def pad_frames(
@@ -213,8 +212,11 @@ def pad_frames(
         >>> [x.shape[0] for x in pad_frames(*still)]
         [48, 48]
     """
+    return _padded(rotations, root, _padded_length(rotations.shape[0]))
+
+
+def _padded(rotations: Array, root: Array, length: int) -> tuple[Array, Array]:
     frames = rotations.shape[0]
-    length = _padded_length(frames)
     if length == frames:
         return rotations, root
     # On the host: another length would be another program here too.
@@ -229,37 +231,94 @@ def _padded_length(frames: int) -> int:
     return less if whole > 16 and less >= frames else whole
 
 
-def _cut(x: Array, frames: int) -> Array:
-    """The first frames; on the host where that costs little, for the reason above."""
-    if x.shape[0] == frames:
-        return x
-    (device, *others) = x.devices()
-    if not others and device.platform == "cpu":
-        return jax.device_put(np.asarray(x)[:frames], device)
-    return x[:frames]
-
-
 def _clothe(
     dresser: Dresser,
     rotations: Float[Array, "frames joints 4"],
     root: Float[Array, "frames 3"],
     fps: float,
 ) -> Clothed:
+    rotations, root, usable, place = _placed(rotations, root)
+    past = dresser.history_length(fps)
+    history = extrapolate_history(rotations, root, past, fps)
+    joints = (jnp.concatenate(pair) for pair in zip(history, (rotations, root), strict=True))
+    r, t = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*joints)
+    # A frame is well if all poses that it saw are.
+    usable = jnp.concatenate([jnp.ones((past,), bool), usable])
+    shifted = (usable[past - k : usable.shape[0] - k] for k in dresser.seen(fps))
+    well = functools.reduce(jnp.logical_and, shifted)
+    return _make_clothed(dresser, infer(dresser, r, t, fps)[1], well, place)
+
+
+def _placed(
+    rotations: Float[Array, "frames joints 4"], root: Float[Array, "frames 3"]
+) -> tuple[Array, Array, Bool[Array, " frames"], Float[Array, "3"]]:
+    """What `_hold` returns, the root relative to a place near it, and that place [m]."""
     rotations, root, usable = _hold(rotations, root)
     place = _on_ground(root[0])
-    root = root - place[None]
-    length = dresser.history_length(fps)
-    history = extrapolate_history(rotations, root, length, fps)
-    joints = (jnp.concatenate(pair) for pair in zip(history, (rotations, root), strict=True))
-    transforms = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*joints)
-    usable = jnp.concatenate([jnp.ones((length,), bool), usable])
-    # A frame is well if all poses that it saw are.
-    shifted = (usable[length - k : usable.shape[0] - k] for k in dresser.seen(fps))
-    well = functools.reduce(jnp.logical_and, shifted)
-    return _make_clothed(dresser, infer(dresser, *transforms, fps)[1], well, place)
+    return rotations, root - place[None], usable, place
 
 
-_clothe_jitted = jax.jit(_clothe, static_argnames="fps")
+_placed_jitted = bounded_jit(keep=8)(_placed)
+
+
+def _clothe_blocks(
+    dresser: Dresser,
+    rotations: Float[Array, "frames joints 4"],
+    root: Float[Array, "frames 3"],
+    fps: float,
+) -> Clothed:
+    """`_clothe` in blocks of one or `BLOCK` frames."""
+    clear_caches_if_full()
+    frames, past = rotations.shape[0], dresser.history_length(fps)
+    length = next(n for n in _LENGTHS if n >= min(frames, BLOCK))
+    # So little is computed for each of these frames that few lengths do.
+    padded = _padded(rotations, root, max(64, 4 ** math.ceil(math.log(frames, 4))))
+    held = _placed_jitted(*padded)
+    # On the host: each cut would be a program too.
+    q, p, usable = (np.asarray(x)[:frames] for x in held[:3])
+    place, state = held[3], None
+    before = extrapolate_history(*(jax.device_put(x[:2]) for x in (q, p)), past, fps)
+    q, p = (np.concatenate([np.asarray(a), b]) for a, b in zip(before, (q, p), strict=True))
+    r, t = pose_transforms(dresser.body, dresser.rest, q, p)
+    usable = np.concatenate([np.ones(past, bool), usable])
+    shifted = (usable[past - k : len(usable) - k] for k in dresser.seen(fps))
+    well = functools.reduce(np.logical_and, shifted)
+    if dresser.guided is not None:
+        state = _init_guided(dresser.guided, *(jax.device_put(x[past - 1]) for x in (r, t)))
+    blocks = []
+    for start in range(0, frames, length):
+        index = np.minimum(np.arange(start - past, start + length), frames - 1) + past
+        a, b, c = (jax.device_put(x) for x in (r[index], t[index], well[index[past:] - past]))
+        block, state = _clothe_block(dresser, a, b, c, place, fps, state)
+        blocks.append(block)
+    return jax.tree.map(lambda *parts: _joined(parts, frames), *blocks)
+
+
+_LENGTHS = (1, BLOCK)
+_init_guided = bounded_jit(keep=4)(init_guided)
+
+
+@bounded_jit(static_argnames=("fps",), keep=4)
+def _clothe_block(
+    dresser: Dresser,
+    rotations: Float[Array, "padded joints 3 3"],
+    translations: Float[Array, "padded joints 3"],
+    well: Bool[Array, " frames"],
+    place: Float[Array, "3"],
+    fps: float,
+    state: GuidedState | None,
+) -> tuple[Clothed, GuidedState | None]:
+    _, cloth, state = infer(dresser, rotations, translations, fps, state)
+    return _make_clothed(dresser, cloth, well, place), state
+
+
+def _joined(blocks: Sequence[Array], frames: int) -> Array:
+    """The first frames of all; on the host where that costs little, for the reason above."""
+    (device, *others) = blocks[0].devices()
+    if not others and device.platform == "cpu":
+        whole = np.concatenate([np.asarray(x) for x in blocks])
+        return jax.device_put(whole[:frames], device)
+    return jnp.concatenate(blocks)[:frames]
 
 
 def init_stream(

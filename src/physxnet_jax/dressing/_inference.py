@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 
-from ..errors import PhysXNetError
+from ..errors import PhysXNetError, check_flags
 from ..models import DEFAULT, Predictor
 
 
@@ -34,3 +34,7 @@ class Inference:
         count = self.strain_iterations
         if not isinstance(count, int) or isinstance(count, bool) or count < 0:
             raise PhysXNetError(f"strain_iterations is {count}; expected a non-negative integer.")
+        try:
+            check_flags(self, "tta", "collisions")
+        except ValueError as e:
+            raise PhysXNetError(f"{e}.") from None

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..body import Body
-from ..errors import FormatError
+from ..errors import FormatError, check_counts, check_flags, check_numbers
 from ..garment import Garment, refine_garment
 from ..motion import Motion
 from ..simulation import (
@@ -77,10 +77,15 @@ class Simulation:
     resume: pathlib.Path | None = None
 
     def __post_init__(self) -> None:
-        if self.refine is not None and not self.refine > 0:
-            raise FormatError(f"refine is {self.refine}, expected a length in metres.")
-        if self.substeps is not None and self.substeps < 1:
-            raise FormatError(f"substeps is {self.substeps}, expected a positive number.")
+        try:
+            check_numbers(self, "refine")
+            if self.substeps is not None:
+                check_counts(self, "substeps")
+            check_flags(self, "self_contact")
+            # They check wind and floor.
+            _ = self.also
+        except ValueError as e:
+            raise FormatError(f"{e}.") from None
         engines = ("xpbd", "bdf2", *EXTERNAL_ENGINES)
         if self.engine not in engines:
             raise FormatError(f"No engine '{self.engine}'; there are {', '.join(engines)}.")

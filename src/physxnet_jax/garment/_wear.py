@@ -82,7 +82,8 @@ def parse_wear(word: str | pathlib.Path) -> WearItem:
         "front": AXES,
     }
     tailored = found["name"] in KINDS
-    allowed = ("fabric", "hold", *MEASURES) if tailored else ("as", "fabric", *_PLACE)
+    places = () if found["name"] in TEMPLATES else _PLACE
+    allowed = ("fabric", "hold", *MEASURES) if tailored else ("as", "fabric", *places)
     measures = {}
     for key, value in options.items():
         if key not in allowed:

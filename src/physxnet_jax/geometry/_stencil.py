@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from ..typing import pytree
 from ._candidates import spread_points
+from ._materialize import materialize
 from ._topology import mesh_edges
 
 # Rows of the distance matrix computed at once.
@@ -45,7 +46,8 @@ class Stencil:
 def _means(index: Array, weight: Array, values: Array) -> Array:
     # Gathering whole rows of a batch at once takes far fewer, longer copies.
     rows = jnp.moveaxis(values, -2, 0)
-    wide = rows.reshape(rows.shape[0], -1)
+    # Not computed anew for each of the rows that take them.
+    wide = materialize(rows.reshape(rows.shape[0], -1))
     out = jnp.zeros_like(wide)
     for k in range(index.shape[1]):
         out = out + weight[:, k, None] * wide[index[:, k]]

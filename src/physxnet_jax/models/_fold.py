@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
+from .._programs import bounded_jit
 from ._blocks import Down, Up, upsample, upsampling_kernel
 from ._networks import Generator
 from ._predictor import Predictor
@@ -109,7 +110,7 @@ def _plain(norm: nnx.BatchNorm | None) -> tuple[tuple[Array | None, ...], float]
     return (norm.var[...], norm.mean[...], _value(norm.scale), _value(norm.bias)), norm.epsilon
 
 
-@jax.jit(static_argnames=("epsilon", "up"))
+@bounded_jit(static_argnames=("epsilon", "up"), keep=32)
 def _folded(
     kernel: Float[Array, "h w inputs outputs"],
     bias: Float[Array, " outputs"] | None,

@@ -1,7 +1,6 @@
 """The predictor: a network with its normalisation and atlas."""
 
 import dataclasses
-import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from flax import nnx
 from jaxtyping import Array, Bool, Float
 
+from .._programs import bounded_jit
 from ..body import Body
 from ..typing import pytree
 from ..uv import CONDITIONS, Atlas, dress_body
@@ -245,7 +245,7 @@ class Predictor:
         return plain + share * (twin - plain)
 
 
-@functools.partial(jax.jit, static_argnums=(0, 1))
+@bounded_jit(static_argnames=("graph", "template"), keep=4)
 def _modulation(
     graph: Any, template: str, state: Any, maps: Float[Array, "batch height width channels"]
 ) -> Modulation:

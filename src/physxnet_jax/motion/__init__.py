@@ -51,6 +51,7 @@ from ._transforms import (
     extrapolate_history as extrapolate_history,
     history_transforms as history_transforms,
     padded_block as padded_block,
+    pose_transforms as pose_transforms,
 )
 from ._variants import (
     at_speed as at_speed,

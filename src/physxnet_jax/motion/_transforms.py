@@ -23,9 +23,19 @@ def clip_transforms(
 ) -> tuple[Float[np.ndarray, "frames joints 3 3"], Float[np.ndarray, "frames joints 3"]]:
     """World rotations and translations [m] of the joints in every frame."""
     check_joints(body, motion)
-    frames = motion.num_frames
+    return pose_transforms(body, rest, np.asarray(motion.rotations), np.asarray(motion.root))
+
+
+def pose_transforms(
+    body: Body,
+    rest: Float[Array, "all 3"],
+    rotations: Float[np.ndarray, "frames joints 4"],
+    root: Float[np.ndarray, "frames 3"],
+) -> tuple[Float[np.ndarray, "frames joints 3 3"], Float[np.ndarray, "frames joints 3"]]:
+    """`clip_transforms` of poses [m]."""
+    frames = len(rotations)
     pick = np.minimum(np.arange(-(-frames // BLOCK) * BLOCK), frames - 1)
-    q, p = np.asarray(motion.rotations)[pick], np.asarray(motion.root)[pick]
+    q, p = rotations[pick], root[pick]
     parts = [
         _transforms(body, rest, q[i : i + BLOCK], p[i : i + BLOCK])
         for i in range(0, len(pick), BLOCK)

@@ -69,9 +69,9 @@ def masked_l1(
         sample_weight: 1 for samples that count, 0 for those without this garment.
 
     Returns:
-        The mean; zero if nothing counts.
+        The mean; zero if nothing counts. Values that don't count may be anything, NaN as well.
     """
-    return _masked_mean(jnp.abs(predicted - target), valid, sample_weight)
+    return _masked_mean(jnp.abs, predicted, target, valid, sample_weight)
 
 
 def masked_l2(
@@ -81,7 +81,7 @@ def masked_l2(
     sample_weight: Float[Array, " batch"],
 ) -> Float[Array, ""]:
     """Mean squared error over the same values as `masked_l1`."""
-    return _masked_mean(jnp.square(predicted - target), valid, sample_weight)
+    return _masked_mean(jnp.square, predicted, target, valid, sample_weight)
 
 
 def pooled_l1(
@@ -172,10 +172,14 @@ def vertex_distance(
 
 
 def _masked_mean(
-    error: Float[Array, "batch texels 3"],
+    distance: Callable[[Array], Array],
+    predicted: Float[Array, "batch texels 3"],
+    target: Float[Array, "batch texels 3"],
     valid: Bool[Array, " texels"],
     sample_weight: Float[Array, " batch"],
 ) -> Float[Array, ""]:
     weight = valid.astype(jnp.float32)[None] * sample_weight[:, None]
+    # 0 times NaN is NaN, in the value and in its gradient.
+    error = distance(jnp.where(weight[..., None] > 0.0, predicted - target, 0.0))
     error = jnp.sum(error, axis=2) / 3.0
     return jnp.sum(weight * error) / jnp.maximum(jnp.sum(weight), 1.0)

@@ -9,6 +9,7 @@ import numpy as np
 from jax.core import Tracer, eval_context
 from jaxtyping import Array, Float
 
+from ..._programs import bounded_jit
 from ...body import Body, load_body
 from ...errors import PhysXNetError
 from ._borders import STRAPLESS_TOP, neck_row
@@ -231,7 +232,7 @@ def _places(pattern: Pattern, levels: Mapping[str, Array]) -> dict[str, Array]:
     return out
 
 
-@functools.partial(jax.jit, static_argnames=("name", "pattern"))
+@bounded_jit(static_argnames=("name", "pattern"), keep=6)
 def cut(
     name: str, pattern: Pattern, measures: Mapping[str, Array], rest: Float[Array, "all 3"]
 ) -> tuple[Float[Array, "vertices 3"], dict[str, Array]]:

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 
 from ...body import NUM_BODY_VERTICES, triangulate
-from ...errors import check_numbers
+from ...errors import check_numbers, check_vector
 from ...geometry import materialize, spread_points, vertex_faces, vertex_normals
 from ...typing import pytree
 from .._assembly import Assembly, float32
@@ -60,8 +60,7 @@ class Air(Effect):
     shelter: float = 0.9
 
     def __post_init__(self) -> None:
-        if len(self.wind) != 3 or not np.isfinite(self.wind).all():
-            raise ValueError(f"wind is {self.wind}, expected three finite numbers [m/s]")
+        check_vector(self, "wind")
         check_numbers(self, "period", "eddy")
         check_numbers(
             self, "gust", "turbulence", "density", "normal", "tangent", "shelter", zero=True

@@ -1,6 +1,8 @@
 """The floor: a horizontal plane with Coulomb friction."""
 
 import dataclasses
+import math
+import numbers
 from collections.abc import Mapping
 from typing import Any
 
@@ -35,8 +37,8 @@ class Floor(Effect):
 
     def __post_init__(self) -> None:
         check_numbers(self, "push")
-        if not np.isfinite(self.height):
-            raise ValueError(f"height is {self.height}, expected a number in metres")
+        if not isinstance(self.height, numbers.Real) or not math.isfinite(self.height):
+            raise ValueError(f"height is {self.height!r}, expected a number in metres")
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Collects the lowest height and the friction of every vertex."""
