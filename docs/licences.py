@@ -25,6 +25,8 @@ _OURS = ("dev", "docs")
 def locked(*extras: str) -> dict[str, str]:
     """Versions of the packages that the base or some extras install, from uv.lock."""
     words = [pathlib.Path(sys.executable).parent / "uv", "export", "--frozen", "--no-emit-project"]
+    # A home that can't be written has no cache.
+    words += ["--no-cache"]
     words += ["--no-hashes", "--no-header", "--no-annotate", "--quiet"]
     for extra in extras:
         words += ["--extra", extra]

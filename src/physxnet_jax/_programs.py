@@ -37,14 +37,17 @@ def bounded_jit(
     def wrap(function: Callable[_P, _T]) -> Callable[_P, _T]:
         # Only the outermost of nested functions can have options.
         within: Any = jax.jit(function, static_argnames=static_argnames)
-        outside: Any = jax.jit(
-            function, static_argnames=static_argnames, compiler_options=few_parts()
-        )
+
+        @functools.cache
+        def bounded() -> Any:
+            options = few_parts() if jax.default_backend() == "cpu" else None
+            return jax.jit(function, static_argnames=static_argnames, compiler_options=options)
 
         @functools.wraps(function)
         def call(*args: _P.args, **kwargs: _P.kwargs) -> _T:
             if any(isinstance(x, Tracer) for x in jax.tree.leaves((args, kwargs))):
                 return within(*args, **kwargs)
+            outside = bounded()
             out = outside(*args, **kwargs)
             if outside._cache_size() > keep:
                 outside.clear_cache()
