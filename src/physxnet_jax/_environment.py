@@ -80,8 +80,8 @@ def uses_compilation_cache(words: Sequence[str]) -> bool:
 def uses_few_parts(words: Sequence[str]) -> bool:
     """Whether a command line is a `physxnet` command that compiles for longer than it computes.
 
-    What is compiled in few parts runs up to twice as long: nothing for commands that simulate,
-    train, show cloth live, or measure times.
+    What is compiled in few parts runs for longer: nothing for commands that simulate, train, show
+    cloth live, or measure times.
     """
     brief = is_command(words) and not _BRIEF.isdisjoint(words[1:2])
     return brief and not any(w.rpartition("=")[2] == "simulate" for w in words)

@@ -194,10 +194,12 @@ __all__ = [
     "PhysXNetError",
     "SimulationError",
     "WeightsError",
+    "check_choices",
     "check_counts",
     "check_flags",
-    "check_vector",
     "check_numbers",
+    "check_rate",
     "check_type",
+    "check_vector",
     "visible",
 ]

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import jax
@@ -16,7 +15,13 @@ from .._programs import bounded_jit
 from ..body import Body, skin_points
 from ..errors import check_rate
 from ..models import apply_sampled_offsets, normalise, point_features, predict_sampled
-from ..motion import BLOCK, ROTATION_LENGTHS, extrapolate_history, pose_transforms
+from ..motion import (
+    BLOCK,
+    ROTATION_LENGTHS,
+    extrapolate_history,
+    padded_block,
+    pose_transforms,
+)
 from ..simulation.effects import TURBULENCE_PERIOD
 from ..typing import pytree
 from ._dresser import Dresser
@@ -237,28 +242,36 @@ def _clothe(
     root: Float[Array, "frames 3"],
     fps: float,
 ) -> Clothed:
-    rotations, root, usable, place = _placed(rotations, root)
     past = dresser.history_length(fps)
+    rotations, root, well, place = _placed(rotations, root, past, dresser.seen(fps))
     history = extrapolate_history(rotations, root, past, fps)
     joints = (jnp.concatenate(pair) for pair in zip(history, (rotations, root), strict=True))
     r, t = jax.vmap(lambda q, p: dresser.body.transforms(dresser.rest, q, p))(*joints)
-    # A frame is well if all poses that it saw are.
-    usable = jnp.concatenate([jnp.ones((past,), bool), usable])
-    shifted = (usable[past - k : usable.shape[0] - k] for k in dresser.seen(fps))
-    well = functools.reduce(jnp.logical_and, shifted)
     return _make_clothed(dresser, infer(dresser, r, t, fps)[1], well, place)
 
 
 def _placed(
-    rotations: Float[Array, "frames joints 4"], root: Float[Array, "frames 3"]
+    rotations: Float[Array, "frames joints 4"],
+    root: Float[Array, "frames 3"],
+    past: int,
+    seen: tuple[int, ...],
 ) -> tuple[Array, Array, Bool[Array, " frames"], Float[Array, "3"]]:
-    """What `_hold` returns, the root relative to a place near it, and that place [m]."""
+    """Usable poses relative to a place near them, which frames saw no other, and the place [m].
+
+    Args:
+        rotations: Joint rotations.
+        root: Positions of the root joint [m].
+        past: Number of poses before the first frame, which are usable.
+        seen: How many frames back the poses lie that a frame depends on.
+    """
     rotations, root, usable = _hold(rotations, root)
     place = _on_ground(root[0])
-    return rotations, root - place[None], usable, place
+    usable = jnp.concatenate([jnp.ones((past,), bool), usable])
+    shifted = (usable[past - k : usable.shape[0] - k] for k in seen)
+    return rotations, root - place[None], functools.reduce(jnp.logical_and, shifted), place
 
 
-_placed_jitted = bounded_jit(keep=8)(_placed)
+_placed_jitted = bounded_jit(static_argnames=("past", "seen"), keep=8)(_placed)
 
 
 def _clothe_blocks(
@@ -270,31 +283,27 @@ def _clothe_blocks(
     """`_clothe` in blocks of one or `BLOCK` frames."""
     clear_caches_if_full()
     frames, past = rotations.shape[0], dresser.history_length(fps)
-    length = next(n for n in _LENGTHS if n >= min(frames, BLOCK))
-    # So little is computed for each of these frames that few lengths do.
-    padded = _padded(rotations, root, max(64, 4 ** math.ceil(math.log(frames, 4))))
-    held = _placed_jitted(*padded)
+    length = 1 if frames == 1 else BLOCK
+    # So little is computed for each of these frames that short clips share a length.
+    padded = _padded(rotations, root, max(64, _padded_length(frames)))
+    *posed, place = _placed_jitted(*padded, past, dresser.seen(fps))
     # On the host: each cut would be a program too.
-    q, p, usable = (np.asarray(x)[:frames] for x in held[:3])
-    place, state = held[3], None
+    q, p, well = (np.asarray(x)[:frames] for x in posed)
     before = extrapolate_history(*(jax.device_put(x[:2]) for x in (q, p)), past, fps)
     q, p = (np.concatenate([np.asarray(a), b]) for a, b in zip(before, (q, p), strict=True))
     r, t = pose_transforms(dresser.body, dresser.rest, q, p)
-    usable = np.concatenate([np.ones(past, bool), usable])
-    shifted = (usable[past - k : len(usable) - k] for k in dresser.seen(fps))
-    well = functools.reduce(np.logical_and, shifted)
+    state = None
     if dresser.guided is not None:
         state = _init_guided(dresser.guided, *(jax.device_put(x[past - 1]) for x in (r, t)))
     blocks = []
     for start in range(0, frames, length):
-        index = np.minimum(np.arange(start - past, start + length), frames - 1) + past
-        a, b, c = (jax.device_put(x) for x in (r[index], t[index], well[index[past:] - past]))
-        block, state = _clothe_block(dresser, a, b, c, place, fps, state)
+        a, b = (jax.device_put(padded_block(x, start + past, past, length)) for x in (r, t))
+        fine = jax.device_put(padded_block(well, start, 0, length))
+        block, state = _clothe_block(dresser, a, b, fine, place, fps, state)
         blocks.append(block)
     return jax.tree.map(lambda *parts: _joined(parts, frames), *blocks)
 
 
-_LENGTHS = (1, BLOCK)
 _init_guided = bounded_jit(keep=4)(init_guided)
 
 

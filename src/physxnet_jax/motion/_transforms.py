@@ -131,7 +131,7 @@ def history_transforms(
     return clip_transforms(body, rest, Motion(q, p, motion.fps, motion.name))
 
 
-def padded_block(values: np.ndarray, start: int, before: int) -> np.ndarray:
-    """``BLOCK`` frames from ``start`` and ``before`` frames ahead of it; ends are repeated."""
-    index = np.arange(start - before, start + BLOCK)
+def padded_block(values: np.ndarray, start: int, before: int, frames: int = BLOCK) -> np.ndarray:
+    """So many frames from ``start`` and ``before`` frames ahead of it; ends are repeated."""
+    index = np.arange(start - before, start + frames)
     return values[np.clip(index, 0, len(values) - 1)]
