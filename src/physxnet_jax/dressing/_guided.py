@@ -21,7 +21,7 @@ from ..simulation import (
     skin_effects,
     start_state,
 )
-from ..simulation.effects import BodyContact, Guide, LayerContact, PreparedGuide
+from ..simulation.effects import BodyContact, Guide, LayerContact, PreparedGuide, Tether
 from ..typing import pytree
 from ._inference import Inference
 from ._simulate import Simulation, build_scene
@@ -154,10 +154,10 @@ def prepare_guided(
         Guide(spacing=_SPACING, time_constant=min(_TIME_CONSTANT * substeps, _LONGEST))
     ]
     # Effects that are given are taken as they are.
-    contact = _contact(len(outfit.garments)) if simulation.effects is None else ()
+    more = (Tether(), *_contact(len(outfit.garments))) if simulation.effects is None else ()
     strain = prepare_strain(outfit, Inference(strain_iterations=_STRAIN))
     assert strain is not None
-    scene = build_scene(outfit.garments, outfit.body, shape, simulation, (*guide, *contact))
+    scene = build_scene(outfit.garments, outfit.body, shape, simulation, (*guide, *more))
     places = {id(g): k for k, g in enumerate(outfit.garments)}
     prepared = prepare_scene(scene)
     system = _softened(make_system(prepared, solver), _softness(substeps * _RATE))
@@ -281,7 +281,7 @@ def advance_guided(
         system = _softened(system, _softness(rate) / _softness(known))
         system = solver.at_step(system, 1.0 / rate)
     target = scene.joined(predicted)
-    means = scene.guide.means(target)
+    means = scene.guide.lengthened(scene.guide.means(target))
     skin = skin_effects(system, rotations[None], translations[None])
 
     def go(_: None) -> State:
@@ -298,8 +298,12 @@ def advance_guided(
         )[0]
 
     def drawn(x: Array) -> Array:
-        """Cloth moved so that its patches lie where they are predicted."""
-        return x + scene.guide.spread(means - scene.guide.means(x))
+        """Cloth moved so that its patches lie where they are predicted.
+
+        Loose ones mostly sideways: raised to a prediction, they would crumple.
+        """
+        moves = means - scene.guide.means(x)
+        return x + scene.guide.spread(moves.at[:, 1].set(scene.guide.held(moves)[:, 1]))
 
     def start(_: None) -> State:
         # Skinned cloth, whose patches lie where they are predicted: a prediction's own hems are

@@ -31,6 +31,7 @@ class Assembly:
         membrane: Stiffness along warp, weft and in shear [N/m], shape [faces, 3].
         density: Mass per area of faces [kg/m^2], shape [faces].
         loose: Vertices that may touch any limb (skirts), shape [vertices].
+        hanging: Vertices of skirts below the hip joints, which swing, shape [vertices].
         parts: First vertex of each garment, followed by the number of vertices.
         coarse_faces: Triangles of the meshes that garments refine, shape [coarse, 3].
         bands: Edges of elastic bands, shape [bands, 2].
@@ -51,6 +52,7 @@ class Assembly:
     membrane: Float[np.ndarray, "faces 3"]
     density: Float[np.ndarray, " faces"]
     loose: Bool[np.ndarray, " vertices"]
+    hanging: Bool[np.ndarray, " vertices"]
     parts: tuple[int, ...]
     coarse_faces: Int[np.ndarray, "coarse 3"]
     bands: Int[np.ndarray, "bands 2"]
@@ -67,7 +69,10 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
     rest, faces, mass, pinned, weights = [], [], [], [], []
     per_vertex: dict[str, list] = {"thickness": [], "friction": []}
     per_face: dict[str, list] = {"stretch": [], "bend": [], "membrane": [], "density": []}
-    loose, coarse, bands = [], [np.zeros((0, 3), np.int64)], [np.zeros((0, 2), np.int64)]
+    loose, hanging = [], []
+    heads = body.joint_positions(rest_body)[0]
+    hips = float(np.mean([heads[body.joint(f"{side}UpLeg"), 1] for side in ("Left", "Right")]))
+    coarse, bands = [np.zeros((0, 3), np.int64)], [np.zeros((0, 2), np.int64)]
     parts, holds = [0], []
     for g in garments:
         x = np.asarray(g.rest_vertices(rest_body), dtype=np.float64)
@@ -99,6 +104,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         per_face["density"].append(np.full(len(f), g.fabric.density))
         holds.append(tuple(c + parts[-1] for c in holding_loops(g).values()))
         loose.append(_loose_vertices(g, x, np.asarray(rest_body, np.float64)))
+        hanging.append((x[:, 1] < hips) & (g.template == "dress"))
         parts.append(parts[-1] + len(x))
     cat = np.concatenate
     return Assembly(
@@ -116,6 +122,7 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         cat(per_face["membrane"]),
         cat(per_face["density"]),
         cat(loose),
+        cat(hanging),
         tuple(parts),
         cat(coarse),
         cat(bands),

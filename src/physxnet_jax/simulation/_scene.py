@@ -36,6 +36,7 @@ from .effects import (
     SelfContact,
     StrainLimit,
     Stretch,
+    Tether,
 )
 
 EFFECTS: dict[str, type[Effect]] = {
@@ -49,6 +50,7 @@ EFFECTS: dict[str, type[Effect]] = {
     "seam": Seam,
     "elastic": Elastic,
     "guide": Guide,
+    "tether": Tether,
     "strain_limit": StrainLimit,
     "self_contact": SelfContact,
     "layer_contact": LayerContact,

@@ -42,7 +42,7 @@ def render_frame(
         FormatError: No such camera or background.
         MissingDependencyError: Without the ``render`` extra.
     """
-    studio = Studio(meshes, size, camera=camera, background=background)
+    studio = Studio(meshes, size, camera=camera, background=background, still=True)
     try:
         return studio.draw(frame)
     finally:
@@ -133,16 +133,16 @@ def render_columns(
         ) from error
     (frames,) = lengths
     studios: list[Studio] = []
+    look: dict[str, Any] = {"camera": camera, "background": background, "fps": fps}
     options: dict[str, Any]
+    still = path.suffix.lower() == ".png"
     try:
         for title, meshes in columns.items():
-            studios.append(
-                Studio(meshes, size, fps=fps, camera=camera, background=background, title=title)
-            )
+            studios.append(Studio(meshes, size, title=title, still=still, **look))
         with atomic_write(path) as part, warnings.catch_warnings():
             # ffmpeg is started by fork and exec: no JAX code runs in between.
             warnings.filterwarnings("ignore", message=".*os.fork.*")
-            if path.suffix.lower() == ".png":
+            if still:
                 chosen = np.unique(_moments(frames, strip))
                 rows = []
                 for studio in studios:

@@ -119,7 +119,44 @@ def test_a_guided_sheet_falls_no_further_and_its_gradients_are_finite():
     assert bool(jnp.isfinite(slope).all()) and float(jnp.abs(slope).max()) > 1e-4
 
 
-@pytest.mark.parametrize("wrong", [{"spacing": 0.0}, {"time_constant": -1.0}])
+def test_a_skirt_is_held_less_than_a_bodice_and_a_loose_sheet_as_much():
+    _, guide = prepared((tailor("aline"),), Guide(0.12, hanging=0.4))
+    hold = np.asarray(guide.hung.hold)
+    assert hold.min() == pytest.approx(0.4, abs=0.02) and hold.max() == pytest.approx(1.0)
+    moves = jnp.ones((len(hold), 3, 1))
+    np.testing.assert_allclose(guide.held(moves)[:, 1, 0], hold)
+    # Nothing else holds a sheet.
+    _, guide = prepared((sheet(),), Guide(0.12))
+    assert guide.hung is None
+    np.testing.assert_array_equal(guide.held(moves), moves)
+
+
+def test_means_of_a_short_skirt_are_lengthened_and_those_at_rest_are_not():
+    scene, guide = prepared((tailor("aline"),), Guide(0.12))
+    rest = guide.means(jnp.asarray(scene.assembly.rest, jnp.float32)[:, :, None])
+    np.testing.assert_allclose(guide.lengthened(rest), rest, atol=1e-5)
+    snug = np.asarray(guide.hung.above) == np.arange(len(rest))
+    assert 0.2 < snug.mean() < 0.8
+    # What lies lower than the hem of the snug part is drawn up to it by 6 %.
+    top = float(rest[snug, 1].min())
+    short = rest.at[:, 1].add(jnp.where(rest[:, 1] < top, 0.06 * (top - rest[:, 1]), 0.0))
+    longer = guide.lengthened(short)
+    np.testing.assert_array_equal(longer[snug], short[snug])
+    lowest = int(jnp.argmin(rest[:, 1, 0]))
+    raised, left = (float(m[lowest, 1, 0] - rest[lowest, 1, 0]) for m in (short, longer))
+    assert raised > 0.015 and left < 0.4 * raised
+
+    def far(m):
+        return jnp.linalg.norm((m - m[guide.hung.above])[:, :, 0], axis=1)
+
+    missing = far(longer) - jnp.minimum(guide.hung.length, 1.1 * far(short))
+    assert float(missing.min()) > -1e-5
+    # Where two patches lie in one place.
+    slope = jax.grad(lambda m: jnp.sum(guide.lengthened(m) ** 2))(jnp.zeros_like(rest))
+    assert bool(jnp.isfinite(slope).all())
+
+
+@pytest.mark.parametrize("wrong", [{"spacing": 0.0}, {"time_constant": -1.0}, {"hanging": -0.1}])
 def test_impossible_settings_are_refused(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         Guide(**wrong)

@@ -34,6 +34,7 @@ from physxnet_jax.simulation.effects import (
     SelfContact,
     StrainLimit,
     Stretch,
+    Tether,
 )
 
 BASE = (Gravity(), Stretch())
@@ -165,5 +166,5 @@ def test_contact_without_friction_computes_none(name):
 
 def test_every_effect_is_idle_without_its_cause_or_always_acts():
     """A new effect belongs to one of these lists."""
-    tested = {type(e) for e, _ in WHOLE.values()} | {Pin, LayerContact, Elastic}
+    tested = {type(e) for e, _ in WHOLE.values()} | {Pin, LayerContact, Elastic, Tether}
     assert set(EFFECTS.values()) - tested == ALWAYS

@@ -35,6 +35,7 @@ from physxnet_jax.simulation.effects import (
     SelfContact,
     StrainLimit,
     Stretch,
+    Tether,
 )
 from physxnet_jax.simulation.newton import NewtonSettings
 
@@ -53,6 +54,7 @@ WRONG = [
     (Damping, {"rate": -5.0}),
     (StrainLimit, {"limit": -0.5}),
     (Seam, {"stiffness": 0.0}),
+    (Tether, {"slack": -0.1}),
     (Seam, {"stiffness": -1e4}),
     (Stretch, {"compression": INF}),
     (Membrane, {"compression": NAN}),

@@ -16,3 +16,4 @@ from ._seam import Seam as Seam
 from ._self_contact import SelfContact as SelfContact
 from ._strain_limit import StrainLimit as StrainLimit
 from ._stretch import Stretch as Stretch
+from ._tether import Tether as Tether

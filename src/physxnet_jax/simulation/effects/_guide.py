@@ -9,15 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 import scipy.sparse as sp
 from jaxtyping import Array, Float, Int
+from scipy.sparse.csgraph import dijkstra
 
 from ...errors import check_numbers
 from ...geometry import materialize, pad_rows, patch_shares
 from ...typing import pytree
-from .._assembly import Assembly, float32
+from .._assembly import Assembly, float32, norm
 from .._effect import Clock, Effect, Prepared, Rest, Step
 
 # Vertices over which the mean of a patch is taken.
 _MEMBERS = 128
+# Largest factor by which the way from a patch to the next above is lengthened [1].
+_LENGTHENED = 1.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,18 +28,22 @@ class Guide(Effect):
     """Draws the means of patches to given positions; folds within a patch are left to the cloth.
 
     Positions are given to `advance` frame by frame; without them nothing is drawn. Each mean hangs
-    on a critically damped spring, whose stiffness doesn't depend on the substep.
+    on a critically damped spring, whose stiffness doesn't depend on the substep. What hangs of
+    skirts is drawn less: where it swings depends on what happened before.
 
     Attributes:
         spacing: Distance between the middles of patches along the cloth [m].
         time_constant: Inverse of the spring's frequency [s].
+        hanging: Share of the pull on what hangs of garments that are snug elsewhere [1].
     """
 
     spacing: float = 0.08
     time_constant: float = 0.03
+    hanging: float = 0.4
 
     def __post_init__(self) -> None:
         check_numbers(self, "spacing", "time_constant")
+        check_numbers(self, "hanging", zero=True)
 
     def prepare(self, assembly: Assembly, inverse_mass: Array) -> Prepared:
         """Divides every garment into patches."""
@@ -45,14 +52,30 @@ class Guide(Effect):
             for a, b in itertools.pairwise(assembly.parts)
         ]
         shares = sp.csr_matrix(sp.block_diag(parts))
-        means = shares.T.multiply(assembly.mass[None]).tocsr()
-        index, weight = _thinned(*pad_rows(means))
+        weights = shares.T.multiply(assembly.mass[None]).tocsr()
+        index, weight = _thinned(*pad_rows(weights))
         back, back_weight = pad_rows(shares)
+        hanging = assembly.hanging.astype(float)
+        for a, b in itertools.pairwise(assembly.parts):
+            # Nothing else holds a garment that hangs everywhere.
+            hanging[a:b] *= not assembly.hanging[a:b].all()
+        share = (weights @ hanging) / np.asarray(weights.sum(axis=1))[:, 0]
+        hung = None
+        if hanging.any():
+            means = np.einsum("pk,pkc->pc", weight, assembly.rest[index])
+            above = _patch_above(means, shares, share)
+            hung = Hung(
+                float32(1.0 - (1.0 - self.hanging) * share),
+                jax.device_put(above),
+                float32(_all_above(above)),
+                float32(np.linalg.norm(means - means[above], axis=1)),
+            )
         return PreparedGuide(
             jax.device_put(index),
             float32(weight),
             jax.device_put(np.ascontiguousarray(back.T)),
             float32(np.ascontiguousarray(back_weight.T)),
+            hung,
             jnp.float32(self.time_constant),
         )
 
@@ -79,6 +102,25 @@ class GuideState:
 
 @pytree
 @dataclasses.dataclass(frozen=True)
+class Hung:
+    """What hangs of a scene's cloth.
+
+    Attributes:
+        hold: Share of the pull on each patch, shape [patches].
+        above: The patch from which each hangs, itself if it is snug, shape [patches].
+        all_above: 1 for a patch itself and all that it hangs from, one by one, else 0; shape
+            [patches, patches].
+        length: Distance from the patch above at rest [m], shape [patches].
+    """
+
+    hold: Float[Array, " patches"]
+    above: Int[Array, " patches"]
+    all_above: Float[Array, "patches patches"]
+    length: Float[Array, " patches"]
+
+
+@pytree
+@dataclasses.dataclass(frozen=True)
 class PreparedGuide(Prepared):
     """The patches of a scene's cloth.
 
@@ -87,6 +129,7 @@ class PreparedGuide(Prepared):
         weight: Their shares of its mean, shape [patches, k].
         back: Patches of each vertex, shape [m, vertices].
         back_weight: Their shares of its correction, shape [m, vertices].
+        hung: What hangs; None if nothing does.
         time_constant: See `Guide` [s].
     """
 
@@ -94,11 +137,31 @@ class PreparedGuide(Prepared):
     weight: Float[Array, "patches k"]
     back: Int[Array, "m vertices"]
     back_weight: Float[Array, "m vertices"]
+    hung: Hung | None
     time_constant: Float[Array, ""]
 
     def means(self, values: Float[Array, "vertices n batch"]) -> Float[Array, "patches n batch"]:
         """Means of vertices over the patches."""
         return jnp.einsum("pk,pkcb->pcb", self.weight, values[self.index])
+
+    def lengthened(self, means: Float[Array, "patches n batch"]) -> Float[Array, "patches n batch"]:
+        """Means moved away from the patches that they hang from, as far as they were at rest.
+
+        A prediction, as a mean over how cloth may swing, has it shorter than it ever is: drawn
+        there, it would crumple.
+        """
+        if self.hung is None:
+            return means
+        way = means - means[self.hung.above]
+        far = norm(jnp.moveaxis(way, 1, -1))
+        some = far > 0.0
+        scale = jnp.where(some, self.hung.length[:, None] / jnp.where(some, far, 1.0), 1.0)
+        more = (jnp.clip(scale, 1.0, _LENGTHENED) - 1.0)[:, None] * way
+        return means + jnp.einsum("pq,qcb->pcb", self.hung.all_above, more)
+
+    def held(self, moves: Float[Array, "patches n batch"]) -> Float[Array, "patches n batch"]:
+        """The share of moves that is left to patches which hang; all of the others."""
+        return moves if self.hung is None else self.hung.hold[:, None, None] * moves
 
     def spread(self, moves: Float[Array, "patches 3 batch"]) -> Float[Array, "vertices 3 batch"]:
         """Moves of patches, interpolated at the vertices."""
@@ -107,7 +170,11 @@ class PreparedGuide(Prepared):
 
     def reshaped(self, rest: Rest) -> Prepared:
         # Patches are of vertices, and weigh them as they were.
-        return self
+        if self.hung is None:
+            return self
+        means = self.means(rest.cloth[:, :, None])[..., 0]
+        length = norm(means - means[self.hung.above])
+        return dataclasses.replace(self, hung=dataclasses.replace(self.hung, length=length))
 
     def receive(
         self, state: GuideState, guide: tuple[Array, Array], begins: Array, length: float
@@ -151,7 +218,45 @@ class PreparedGuide(Prepared):
         away = begin + progress * way - at
         slower = (step.share * way - gone) * (step.length / substep)
         pull = (r * r * away + 2.0 * r * slower) / (1.0 + 2.0 * r + r * r)
-        return displacement + state.on * self.spread(pull)
+        return displacement + state.on * self.spread(self.held(pull))
+
+
+def _patch_above(
+    means: Float[np.ndarray, "patches 3"],
+    shares: sp.csr_matrix,
+    share: Float[np.ndarray, " patches"],
+) -> Int[np.ndarray, " patches"]:
+    """The next patch on the way along the cloth to where it is snug, from each patch that hangs.
+
+    Args:
+        means: Means of patches at rest [m].
+        shares: Of patches in vertices; patches that share a vertex are neighbours.
+        share: Share of each patch that hangs.
+
+    Returns:
+        Patches; a snug one has itself, as has one from which nothing snug is reached.
+    """
+    itself = np.arange(len(means))
+    snug = np.flatnonzero(share <= 0.5)
+    if not len(snug):
+        return itself
+    near = sp.triu(shares.T @ shares, 1).tocoo()
+    far = np.linalg.norm(means[near.row] - means[near.col], axis=1)
+    graph = sp.csr_matrix((far, (near.row, near.col)), (len(means), len(means)))
+    _, before, _ = dijkstra(
+        graph, directed=False, indices=snug, min_only=True, return_predecessors=True
+    )
+    return np.where(before < 0, itself, before)
+
+
+def _all_above(above: Int[np.ndarray, " patches"]) -> Float[np.ndarray, "patches patches"]:
+    """For each patch a row of ones for itself and all from which it hangs, else zeros."""
+    held = np.zeros((len(above), len(above)))
+    rows = at = np.arange(len(above))
+    while (held[rows, at] == 0.0).any():
+        held[rows, at] = 1.0
+        at = above[at]
+    return held
 
 
 def _thinned(

@@ -125,4 +125,5 @@ def with_samples(assembly: Assembly, samples: Samples) -> Assembly:
         thickness=more(assembly.thickness),
         friction=more(assembly.friction),
         loose=some(assembly.loose),
+        hanging=some(assembly.hanging),
     )
