@@ -300,7 +300,7 @@ def advance_guided(
     def drawn(x: Array) -> Array:
         """Cloth moved so that its patches lie where they are predicted.
 
-        Loose ones mostly sideways: raised to a prediction, they would crumple.
+        Those that hang mostly sideways: raised to a prediction, they would crumple.
         """
         moves = means - scene.guide.means(x)
         return x + scene.guide.spread(moves.at[:, 1].set(scene.guide.held(moves)[:, 1]))

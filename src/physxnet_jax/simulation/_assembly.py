@@ -104,7 +104,9 @@ def assemble(garments: tuple[Garment, ...], body: Body, shape: Float[Array, " sh
         per_face["density"].append(np.full(len(f), g.fabric.density))
         holds.append(tuple(c + parts[-1] for c in holding_loops(g).values()))
         loose.append(_loose_vertices(g, x, np.asarray(rest_body, np.float64)))
-        hanging.append((x[:, 1] < hips) & (g.template == "dress"))
+        low = (x[:, 1] < hips) & (g.template == "dress")
+        # A piece without anything higher has nothing to hang from.
+        hanging.append(low & ~low.all())
         parts.append(parts[-1] + len(x))
     cat = np.concatenate
     return Assembly(

@@ -124,7 +124,7 @@ class Studio:
             ``turntable`` goes around once. All keep the person in the middle.
         background: A name in `BACKGROUNDS`, or ``#rrggbb``.
         title: Text above the picture.
-        still: For single pictures: smoother edges, at twice the time.
+        still: For single pictures: smoother edges, in more time.
     """
 
     def __init__(

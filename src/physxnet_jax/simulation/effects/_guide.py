@@ -34,7 +34,7 @@ class Guide(Effect):
     Attributes:
         spacing: Distance between the middles of patches along the cloth [m].
         time_constant: Inverse of the spring's frequency [s].
-        hanging: Share of the pull on what hangs of garments that are snug elsewhere [1].
+        hanging: Share of the pull on what hangs [1].
     """
 
     spacing: float = 0.08
@@ -55,13 +55,9 @@ class Guide(Effect):
         weights = shares.T.multiply(assembly.mass[None]).tocsr()
         index, weight = _thinned(*pad_rows(weights))
         back, back_weight = pad_rows(shares)
-        hanging = assembly.hanging.astype(float)
-        for a, b in itertools.pairwise(assembly.parts):
-            # Nothing else holds a garment that hangs everywhere.
-            hanging[a:b] *= not assembly.hanging[a:b].all()
-        share = (weights @ hanging) / np.asarray(weights.sum(axis=1))[:, 0]
         hung = None
-        if hanging.any():
+        if assembly.hanging.any():
+            share = (weights @ assembly.hanging) / np.asarray(weights.sum(axis=1))[:, 0]
             means = np.einsum("pk,pkc->pc", weight, assembly.rest[index])
             above = _patch_above(means, shares, share)
             hung = Hung(

@@ -47,8 +47,6 @@ class Tether(Effect):
         length = np.zeros(len(assembly.rest))
         for a, b in itertools.pairwise(assembly.parts):
             part = slice(a, b)
-            if assembly.hanging[part].all():
-                continue
             faces = faces_between(assembly.faces, a, b)
             snug = np.flatnonzero(~assembly.hanging[part])
             found, far = _nearest(assembly.rest[part], faces, snug)
@@ -61,9 +59,8 @@ class Tether(Effect):
         )
 
     def idle(self, assembly: Assembly) -> bool:
-        """Where nothing hangs, or nothing is snug."""
-        hanging = [assembly.hanging[a:b] for a, b in itertools.pairwise(assembly.parts)]
-        return all(x.all() or not x.any() for x in hanging)
+        """Where nothing hangs."""
+        return not assembly.hanging.any()
 
 
 @pytree
